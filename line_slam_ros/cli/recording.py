@@ -1,0 +1,66 @@
+"""A run as messages in a bag that Foxglove and RViz open: the topics of the node, stamped with sensor time."""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from line_slam_ros.cli.bag_writer import BagWriter
+from line_slam_ros.types import F64, Estimate
+from msg_adapters import outputs
+
+_PATH_POSES = 1000  # a longer path is thinned out
+_PERIOD_NS = 1_000_000_000  # of map, path, points and diagnostics
+
+
+class Recording:
+    """Writes poses at frame rate, everything bigger once a second and at the end."""
+
+    def __init__(self, writer: BagWriter, odom_frame: str, body_frame: str, namespace: str = '/line_slam') -> None:
+        self._writer, self._new = writer, writer.new
+        self._odom, self._body, self._namespace = odom_frame, body_frame, namespace
+        self._path: list[tuple[int, F64]] = []
+        self._every = 1  # of the estimates go into the path
+        self._estimates = 0
+        self._state_ns = -_PERIOD_NS
+
+    def estimate(self, estimate: Estimate, gyro_variance: float = 0.0) -> None:
+        """Odometry, pose and transform."""
+        t_ns, new = estimate.t_ns, self._new
+        moved = outputs.transform(new, t_ns, estimate.T_WB, self._odom, self._body)
+        self._writer.write('/tf', t_ns, outputs.tf(new, [moved]))
+        self._write('odometry', t_ns, outputs.odometry(new, estimate, self._odom, self._body, gyro_variance))
+        self._write('pose', t_ns, outputs.pose(new, estimate, self._odom))
+        self._extend_path(t_ns, estimate.T_WB)
+
+    def state(self, t_ns: int, slam: Any, counts: Mapping[str, int]) -> None:
+        """Diagnostics, map, path and points of a Slam or LineMapper, if they are due."""
+        if abs(t_ns - self._state_ns) < _PERIOD_NS:
+            return
+        self._state_ns = t_ns
+        values = {**counts, 'resets': slam.resets}
+        health = outputs.diagnostics(self._new, t_ns, slam.status, slam.waiting_for, values)
+        self._writer.write('/diagnostics', t_ns, health)
+        if self._path:
+            self._write_world(t_ns, slam)
+
+    def finish(self, t_ns: int, slam: Any) -> None:
+        """The final map and path."""
+        self._write_world(t_ns, slam)
+
+    def _write_world(self, t_ns: int, slam: Any) -> None:
+        whole, active = slam.line_map.segments(), slam.active_lines()
+        self._write('lines', t_ns, outputs.lines_marker(self._new, whole.ends, t_ns, self._odom), latched=True)
+        marker = outputs.lines_marker(self._new, active.ends, t_ns, self._odom, 'active', outputs.ACTIVE_COLOUR, 0.015)
+        self._write('lines', t_ns, marker, latched=True)
+        self._write('points', t_ns, outputs.points_cloud(self._new, slam.points(), t_ns, self._odom))
+        self._write('path', t_ns, outputs.path(self._new, self._path, t_ns, self._odom))
+
+    def _extend_path(self, t_ns: int, T_WB: F64) -> None:
+        if self._estimates % self._every == 0:
+            self._path.append((t_ns, T_WB))
+        self._estimates += 1
+        if len(self._path) > _PATH_POSES:
+            self._path, self._every = self._path[::2], 2 * self._every
+
+    def _write(self, name: str, t_ns: int, message: Any, latched: bool = False) -> None:
+        self._writer.write(f'{self._namespace}/{name}', t_ns, message, latched)

@@ -1,0 +1,242 @@
+"""The sliding window's life: insert, triangulate, optimise, cull, choose keyframes, marginalise, notice failure."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from line_slam_ros.config import Estimator as Options
+from line_slam_ros.estimation.initialisation import Snapshot, Start
+from line_slam_ros.estimation.marginalisation import drop_state, marginalise_oldest
+from line_slam_ros.estimation.solver import Solver, SolverOptions
+from line_slam_ros.estimation.triangulation import start_lines, start_points
+from line_slam_ros.estimation.window import STATE, Window
+from line_slam_ros.factors.line_reprojection import world_line
+from line_slam_ros.types import F64, I64, Calibration, Observations, Samples
+
+MAX_GYRO_BIAS, MAX_ACCEL_BIAS, MAX_SPEED = 0.5, 2.5, 50.0  # rad/s, m/s^2, m/s: beyond, the estimate is nonsense
+MIN_FEATURES = 6  # fewer in view and the camera is blind
+
+
+@dataclass(frozen=True, slots=True)
+class WindowLines:
+    """The window's lines as the map wants them."""
+
+    ids: I64  # (L,)
+    pluecker: F64  # (L, 6) [n, d] in W, |d| = 1
+    cov: F64  # (L, 6, 6)
+    views: I64  # (L,)
+    seen: np.ndarray  # (L, n) bool, by which states
+    ends: F64  # (L, n, 2, 2) where they saw them, normalised
+    T_WC: F64  # (n, 4, 4) camera poses of the states
+
+
+def world_lines(host: bool, U: F64, phi: F64, rho: F64, origin: F64) -> tuple[F64, F64]:
+    """Lines of the window (L, 3, 3), (L,), (L,), (L, 3) -> Pluecker (L, 6) with |d| = 1 and its tangent (L, 6, 4)."""
+    L, J = np.empty((len(phi), 6)), np.empty((len(phi), 6, 4))
+    for i in range(len(phi)):
+        world_line(host, U[i], phi[i], rho[i], origin[i], L[i, :3], L[i, 3:], J[i])
+    length = np.linalg.norm(L[:, 3:], axis=1)[:, None]
+    L = L / length
+    along = np.einsum('ni,nij->nj', L[:, 3:], J[:, 3:])
+    return L, (J - L[:, :, None] * along[:, None, :]) / length[:, :, None]
+
+
+class Estimator:
+    """Owns the window. Slam feeds it frames; it never sees an image."""
+
+    def __init__(self, options: Options, calibration: Calibration, focal_px: float, max_points: int, max_lines: int):
+        self.options, self.focal = options, focal_px
+        self.window = Window(options.window + 1, calibration.imu_noise, 4 * max_points + 64, 4 * max_lines + 64)
+        self.g_W = np.array([0.0, 0.0, -options.gravity])
+        self.R_BC, self.p_BC = calibration.T_BC[:3, :3].copy(), calibration.T_BC[:3, 3].copy()
+        self.solver = Solver(self.window, SolverOptions(self.R_BC, self.p_BC, self.g_W, options.loss_scale**2,
+                                                        options.loss_scale**2, options.line_representation == 'host'))
+        self.newest_is_keyframe = True
+        self.failure = ''
+        self._last_sight_ns = 0
+
+    # -- start ---------------------------------------------------------------------------------------------------
+
+    def begin(self, start: Start, shots: list[Snapshot], still: bool) -> None:
+        """Fill the window with initial states; the first one's position and heading become the gauge."""
+        w = self.window
+        w.clear()
+        bias = np.concatenate([start.gyro_bias, np.zeros(3)])
+        for k, shot in enumerate(shots):
+            w.append(shot.t_ns, start.R_WB[k], start.p_W[k], start.v_W[k], bias, shot.samples)
+            w.still[k] = still
+            self._register(k, shot.observations)
+        o = self.options
+        sigma = np.concatenate([[0.3, 0.3, 1e-4], np.full(3, 1e-4), np.full(3, 10.0),
+                                np.full(3, o.gyro_bias_sigma), np.full(3, o.accel_bias_sigma)])
+        self._last_sight_ns = shots[-1].t_ns
+        information = np.diag(sigma**-2.0)
+        R = w.R[0]  # rotation sigma is about the world axes: heading fixed, tilt free
+        information[:3, :3] = R.T @ information[:3, :3] @ R
+        w.freeze(np.arange(1))
+        w.prior_H[:STATE, :STATE] = information
+        self.newest_is_keyframe = True
+        self._triangulate()
+
+    def refine(self, rounds: int) -> float:
+        """Optimise a freshly filled window, relinearising everything between rounds. Returns the final cost."""
+        w = self.window
+        for _ in range(rounds):
+            self.solver.optimise(5)
+            w.recentre_prior()
+            for k in range(w.n - 1):
+                w.integrate(k)
+        return self.solver.cost()
+
+    def linearise(self) -> None:
+        """Fresh normal equations at the present estimate, for covariances."""
+        w = self.window
+        self.solver.linearise(w.points.solved[:w.points.count], w.lines.solved[:w.lines.count])
+
+    # -- what it knows --------------------------------------------------------------------------------------------
+
+    def gyro_bias(self) -> F64:
+        """(3,) rad/s; zero before the start."""
+        return self.window.b[self.window.n - 1, :3] if self.window.n else np.zeros(3)
+
+    def covariance(self) -> F64:
+        """(9, 9) of the newest state's [rotation in B, position in W, velocity in W], as of the last linearisation."""
+        return self.solver.covariance(self.window.n - 1)[:9, :9]
+
+    def last_good(self) -> tuple[F64, float]:
+        """Position (3,) and heading of the newest finite state, the origin when there is none."""
+        w = self.window
+        for k in range(w.n - 1, -1, -1):
+            if np.isfinite(w.p[k]).all() and np.linalg.norm(w.v[k]) < MAX_SPEED:
+                return w.p[k].copy(), float(np.arctan2(w.R[k, 1, 0], w.R[k, 0, 0]))
+        return np.zeros(3), 0.0
+
+    def points(self) -> F64:
+        """Solved points (N, 3) in W."""
+        t = self.window.points
+        c = np.flatnonzero(t.solved[:t.count])
+        rays = np.c_[t.abr[c, :2], np.ones(len(c))] / t.abr[c, 2:]
+        return np.einsum('nij,nj->ni', t.R_WA[c], rays) + t.p_WA[c]
+
+    def lines(self) -> WindowLines:
+        """Solved lines of the window with their covariance, poses held fixed."""
+        self.linearise()
+        w, t, n = self.window, self.window.lines, self.window.n
+        rows = np.flatnonzero(t.solved[:t.count])
+        pluecker, J = world_lines(self.solver.options.host_lines, t.U[rows], t.phi[rows], t.rho[rows], t.origin[rows])
+        cov = J @ self.solver.line_covariances(rows) @ J.transpose(0, 2, 1)
+        T_WC = np.tile(np.eye(4), (n, 1, 1))
+        T_WC[:, :3, :3], T_WC[:, :3, 3] = w.R[:n] @ self.R_BC, w.p[:n] + w.R[:n] @ self.p_BC
+        return WindowLines(t.ids[rows], pluecker, cov, t.views[rows] + t.seen[rows, :n].sum(axis=1),
+                           t.seen[rows, :n], t.z[rows, :n], T_WC)
+
+    # -- every frame ---------------------------------------------------------------------------------------------
+
+    def step(self, observations: Observations, samples: Samples, still: bool) -> tuple[I64, I64]:
+        """Take one frame in; returns the ids of points and lines found to be outliers."""
+        w = self.window
+        newest = self._predict(observations.t_ns, samples)
+        w.still[newest] = still
+        self._register(newest, observations)
+        if not self.newest_is_keyframe and (still or not w.still[newest - 1]):
+            drop_state(self.solver, newest - 1)
+        self._triangulate()
+        self.solver.optimise(self.options.max_iterations)
+        outliers = self._cull()
+        self.newest_is_keyframe = self._is_keyframe()
+        self.failure = self._health()
+        return outliers
+
+    def marginalise(self) -> None:
+        """Make room for the next frame once the window is full."""
+        w = self.window
+        if w.n < w.slots - 1 or (w.n < w.slots and not self.newest_is_keyframe):
+            return
+        p, q, newest = w.points, w.lines, w.n - 1
+        q.views[:q.count] += q.seen[:q.count, 0]
+        marginalise_oldest(self.solver, self._leaving(p, newest), self._leaving(q, newest))
+        self._forget_unseen()
+
+    @staticmethod
+    def _leaving(table, newest: int) -> np.ndarray:
+        """Solved landmarks that slot 0 saw and the newest does not: they end with slot 0."""
+        c = table.count
+        return table.solved[:c] & table.seen[:c, 0] & ~table.seen[:c, newest] & (table.seen[:c].sum(axis=1) >= 2)
+
+    def _predict(self, t_ns: int, samples: Samples) -> int:
+        w, k = self.window, self.window.n - 1
+        newest = w.append(t_ns, w.R[k], w.p[k], w.v[k], w.b[k], samples)
+        dt = w.dt[k]
+        w.p[newest] = w.p[k] + w.v[k] * dt + 0.5 * self.g_W * dt**2 + w.R[k] @ w.dp[k]
+        w.v[newest] = w.v[k] + self.g_W * dt + w.R[k] @ w.dv[k]
+        w.R[newest] = w.R[k] @ w.dR[k]
+        return newest
+
+    def _register(self, slot: int, seen: Observations) -> None:
+        sigma = np.full((len(seen.points.ids), 2), self.options.point_sigma_px / self.focal)
+        self.window.points.observe(slot, seen.points.ids, seen.points.x, sigma)
+        self.window.lines.observe(slot, seen.lines.ids, seen.lines.ends, seen.lines.sigma)
+
+    def _triangulate(self) -> None:
+        w, o, n = self.window, self.solver.options, self.window.n
+        p, q = w.points, w.lines
+        start_points(n, w.R, w.p, self.R_BC, self.p_BC, ~p.solved[:p.count], p.seen, p.z, p.sigma, p.abr, p.R_WA,
+                     p.p_WA, o.rho0, o.w_rho, p.solved)
+        todo = ~q.solved[:q.count] & (q.seen[:q.count].sum(axis=1) >= self.options.line_min_views)
+        min_sine = np.sin(np.radians(self.options.line_min_parallax_deg))
+        start_lines(n, w.R, w.p, self.R_BC, self.p_BC, todo, q.seen, q.z, min_sine,
+                    o.host_lines, q.U, q.phi, q.rho, q.origin, q.solved)
+
+    def _cull(self) -> tuple[I64, I64]:
+        """Landmarks whose newest view fails the chi-square gate lose it; those mostly wrong go for good."""
+        w, n = self.window, self.window.n
+        gate, gone = self.options.gate_chi2, []
+        for table, chi2 in ((w.points, self.solver.chi2_points), (w.lines, self.solver.chi2_lines)):
+            c = table.count
+            seen, solved = table.seen[:c, :n], table.solved[:c]
+            bad = seen & solved[:, None] & (chi2[:c, :n] > gate)
+            table.seen[:c, :n] &= ~bad
+            views = table.seen[:c, :n].sum(axis=1)
+            dead = bad.any(axis=1) & ((views < 2) | (bad.sum(axis=1) > views) | bad[:, n - 1])
+            gone.append(table.ids[:c][dead].copy())
+            table.keep(~dead)
+        return gone[0], gone[1]
+
+    def _forget_unseen(self) -> None:
+        """Rows that no slot sees any more."""
+        for table in (self.window.points, self.window.lines):
+            table.keep(table.seen[:table.count, :self.window.n].any(axis=1))
+
+    def _is_keyframe(self) -> bool:
+        """By mean parallax (rotation removed) against the previous keyframe, share of shared tracks, and time."""
+        w, n = self.window, self.window.n
+        if n < 2:
+            return True
+        if w.still[n - 1]:
+            return False
+        a, b = n - 2, n - 1
+        t = w.points
+        both = t.seen[:t.count, a] & t.seen[:t.count, b]
+        now = t.seen[:t.count, b].sum()
+        if (w.t_ns[b] - w.t_ns[a]) * 1e-9 > self.options.keyframe_max_s:
+            return True
+        if both.sum() < max(0.5 * now, 1):
+            return bool(now > 0)
+        R = self.R_BC.T @ w.R[a].T @ w.R[b] @ self.R_BC
+        rays = np.c_[t.z[:t.count, b][both], np.ones(both.sum())] @ R.T
+        parallax = np.linalg.norm(rays[:, :2] / rays[:, 2:] - t.z[:t.count, a][both], axis=1)
+        return float(np.mean(parallax)) * self.focal > self.options.keyframe_parallax_px
+
+    def _health(self) -> str:
+        """Why the estimate cannot be trusted any more, or ''."""
+        w, k = self.window, self.window.n - 1
+        speed = float(np.linalg.norm(w.v[k]))
+        if not np.isfinite(w.p[k]).all() or speed > MAX_SPEED:
+            return f'estimated speed {speed:.0f} m/s'
+        if np.linalg.norm(w.b[k, :3]) > MAX_GYRO_BIAS or np.linalg.norm(w.b[k, 3:]) > MAX_ACCEL_BIAS:
+            return f'estimated IMU biases {w.b[k].round(2).tolist()} rad/s, m/s^2'
+        if w.points.seen[:w.points.count, k].sum() + w.lines.seen[:w.lines.count, k].sum() >= MIN_FEATURES:
+            self._last_sight_ns = w.t_ns[k]
+        blind = (w.t_ns[k] - self._last_sight_ns) * 1e-9
+        return f'no features for {blind:.1f} s' if blind > self.options.max_blind_s else ''

@@ -1,0 +1,242 @@
+"""Levenberg-Marquardt over the window: inertial, point and line factors and the prior, landmarks eliminated by Schur.
+
+Everything per observation is compiled (landmarks.py); the reduced system (15 per state) is solved by LAPACK.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from line_slam_ros.estimation.landmarks import (
+    add_lines,
+    add_points,
+    back_substitute,
+    line_cost,
+    mirror,
+    point_cost,
+    retract_landmarks,
+)
+from line_slam_ros.estimation.window import STATE, Window, state_difference
+from line_slam_ros.factors.imu_factor import imu_jacobians, imu_residual
+from line_slam_ros.geometry.lie_kernels import retract_rotation
+from line_slam_ros.types import F64
+
+CONVERGED = 1e-3  # relative decrease of the cost below which iterating ends
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def add_links(first, last, R, p, v, b, R0, p0, v0, b0, dt, dR, dp, dv, J_b, b_lin, W, w_b, g_W, H, g):
+    """Inertial factors of links first .. last - 1 into (H, g); residuals at present, Jacobians at first estimates."""
+    r, J_i, J_j = np.empty(15), np.empty((15, 15)), np.empty((15, 15))
+    for k in range(first, last):
+        m = k + 1
+        imu_residual(R[k], p[k], v[k], b[k], R[m], p[m], v[m], b[m], dt[k], dR[k], dp[k], dv[k], J_b[k], b_lin[k],
+                     W[k], w_b[k], g_W, r)
+        imu_jacobians(R0[k], p0[k], v0[k], b0[k], R0[m], p0[m], v0[m], b0[m], dt[k], dR[k], dp[k], dv[k], J_b[k],
+                      b_lin[k], W[k], w_b[k], g_W, J_i, J_j)
+        o, q = STATE * k, STATE * m
+        for i in range(15):
+            for j in range(15):
+                ii, ij, jj = 0.0, 0.0, 0.0
+                for x in range(15):
+                    ii += J_i[x, i] * J_i[x, j]
+                    ij += J_i[x, i] * J_j[x, j]
+                    jj += J_j[x, i] * J_j[x, j]
+                H[o + i, o + j] += ii
+                H[o + i, q + j] += ij
+                H[q + j, o + i] += ij
+                H[q + i, q + j] += jj
+            for x in range(15):
+                g[o + i] += J_i[x, i] * r[x]
+                g[q + i] += J_j[x, i] * r[x]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def link_cost(n, R, p, v, b, dt, dR, dp, dv, J_b, b_lin, W, w_b, g_W):
+    """Half the squared whitened inertial residuals of all links."""
+    r, cost = np.empty(15), 0.0
+    for k in range(n - 1):
+        m = k + 1
+        imu_residual(R[k], p[k], v[k], b[k], R[m], p[m], v[m], b[m], dt[k], dR[k], dp[k], dv[k], J_b[k], b_lin[k],
+                     W[k], w_b[k], g_W, r)
+        for i in range(15):
+            cost += r[i] * r[i]
+    return 0.5 * cost
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def retract_states(n, R, p, v, b, dx):
+    """Apply a step dx (15 n,) in place."""
+    for k in range(n):
+        o = STATE * k
+        retract_rotation(R[k], dx[o:o + 3], R[k])
+        for i in range(3):
+            p[k, i] += dx[o + 3 + i]
+            v[k, i] += dx[o + 6 + i]
+        for i in range(6):
+            b[k, i] += dx[o + 9 + i]
+
+
+@dataclass(frozen=True, slots=True)
+class SolverOptions:
+    """Numbers the optimiser needs besides the window."""
+
+    R_BC: F64  # (3, 3)
+    p_BC: F64  # (3,)
+    g_W: F64  # (3,) m/s^2
+    point_c2: float  # Cauchy scale of points, squared standard deviations
+    line_c2: float
+    host_lines: bool = False  # 2-parameter lines in their host's observation plane
+    rho0: float = 0.3  # 1/m, where points without parallax are believed to be
+    w_rho: float = 0.03  # m, weight of that belief: thousands of points must not add up to a belief in scale
+    still_speed: float = 0.01  # m/s, how still a body at rest is
+    still_shift: float = 1e-3  # m, and how far it may move between two states at rest
+
+
+class Solver:
+    """Optimises a Window in place; owns every buffer it needs."""
+
+    def __init__(self, window: Window, options: SolverOptions):
+        self.window, self.options = window, options
+        dim, rows_p, rows_l, slots = STATE * window.slots, len(window.points.ids), len(window.lines.ids), window.slots
+        self.H, self.g, self._delta = np.zeros((dim, dim)), np.zeros(dim), np.zeros(dim)
+        self._E_p, self._E_l = np.zeros((rows_p, slots, 6, 3)), np.zeros((rows_l, slots, 6, 4))
+        self._A_p, self._A_l = np.zeros((rows_p, 3, 3)), np.zeros((rows_l, 4, 4))
+        self._a_p, self._a_l = np.zeros((rows_p, 3)), np.zeros((rows_l, 4))
+        self._step_p, self._step_l = np.zeros((rows_p, 3)), np.zeros((rows_l, 4))
+        self.chi2_points, self.chi2_lines = np.zeros((rows_p, slots)), np.zeros((rows_l, slots))
+        self._damping = 1e-6
+
+    def linearise(self, use_points, use_lines, damping: float = 0.0, links: tuple[int, int] | None = None) -> None:
+        """Fill H (15 n, 15 n) and g from the chosen landmarks, the prior, links [first, last) and their rests.
+
+        The last state of a range of links is left to the range that starts with it.
+        """
+        w, o, n = self.window, self.options, self.window.n
+        w.unfrozen_to_current()
+        dim = STATE * n
+        self.H[:dim, :dim], self.g[:dim] = w.prior_H[:dim, :dim], w.prior_g[:dim]
+        self.g[:dim] += w.prior_H[:dim, :dim] @ self.state_delta()
+        first, last = links or (0, n - 1)
+        add_links(first, last, w.R, w.p, w.v, w.b, w.R0, w.p0, w.v0, w.b0, w.dt, w.dR, w.dp, w.dv, w.J_b, w.b_lin,
+                  w.W, w.w_b, o.g_W, self.H, self.g)
+        self._add_rest(first, last, n if links is None else last)
+        t = w.points
+        add_points(n, w.R, w.p, w.R0, w.p0, o.R_BC, o.p_BC, use_points, t.seen, t.z, t.sigma, t.abr, t.R_WA, t.p_WA,
+                   o.point_c2, o.rho0, o.w_rho, damping, self.H, self.g, self._E_p, self._A_p, self._a_p)
+        t = w.lines
+        add_lines(n, w.R, w.p, w.R0, w.p0, o.R_BC, o.p_BC, use_lines, t.seen, t.z, t.sigma, o.host_lines, t.U,
+                  t.phi, t.rho, t.origin, o.line_c2, damping, self.H, self.g, self._E_l, self._A_l, self._a_l)
+        mirror(n, self.H)
+
+    def _add_rest(self, first: int, last: int, end: int) -> None:
+        """States [first, end) at rest have no velocity; links [first, last) between two of them have no length."""
+        w, o, one = self.window, self.options, np.eye(3)
+        for k in first + np.flatnonzero(w.still[first:end]):
+            v = slice(STATE * k + 6, STATE * k + 9)
+            self.H[v, v] += one / o.still_speed**2
+            self.g[v] += w.v[k] / o.still_speed**2
+        for k in first + np.flatnonzero(w.still[first:last] & w.still[first + 1:last + 1]):
+            a, b = slice(STATE * k + 3, STATE * k + 6), slice(STATE * k + 18, STATE * k + 21)
+            shift = (w.p[k + 1] - w.p[k]) / o.still_shift**2
+            self.H[a, a] += one / o.still_shift**2
+            self.H[b, b] += one / o.still_shift**2
+            self.H[a, b] -= one / o.still_shift**2
+            self.H[b, a] -= one / o.still_shift**2
+            self.g[a] -= shift
+            self.g[b] += shift
+
+    def _rest_cost(self) -> float:
+        w, o, n = self.window, self.options, self.window.n
+        both = w.still[:n - 1] & w.still[1:n]
+        return 0.5 * float(np.sum((w.v[:n][w.still[:n]] / o.still_speed) ** 2)
+                           + np.sum((np.diff(w.p[:n], axis=0)[both] / o.still_shift) ** 2))
+
+    def state_delta(self) -> F64:
+        """(15 n,) present states minus their first estimates."""
+        w = self.window
+        state_difference(w.n, w.R, w.p, w.v, w.b, w.R0, w.p0, w.v0, w.b0, self._delta)
+        return self._delta[:STATE * w.n]
+
+    def cost(self) -> float:
+        """Present robust cost; refreshes chi2_points and chi2_lines (rows, slots)."""
+        w, o, n = self.window, self.options, self.window.n
+        dim, p, q = STATE * n, w.points, w.lines
+        d = self.state_delta()
+        prior = d @ (0.5 * (w.prior_H[:dim, :dim] @ d) + w.prior_g[:dim])
+        return (prior + self._rest_cost() + self.inertial_cost()
+                + point_cost(n, w.R, w.p, o.R_BC, o.p_BC, p.solved[:p.count], p.seen, p.z, p.sigma, p.abr, p.R_WA,
+                             p.p_WA, o.point_c2, o.rho0, o.w_rho, self.chi2_points)
+                + line_cost(n, w.R, w.p, o.R_BC, o.p_BC, q.solved[:q.count], q.seen, q.z, q.sigma, o.host_lines,
+                            q.U, q.phi, q.rho, q.origin, o.line_c2, self.chi2_lines))
+
+    def inertial_cost(self) -> float:
+        """Half the squared whitened residuals of all inertial links."""
+        w = self.window
+        return link_cost(w.n, w.R, w.p, w.v, w.b, w.dt, w.dR, w.dp, w.dv, w.J_b, w.b_lin, w.W, w.w_b, self.options.g_W)
+
+    def optimise(self, iterations: int) -> float:
+        """Up to that many steps; returns the final cost."""
+        w = self.window
+        use_p, use_l = w.points.solved[:w.points.count], w.lines.solved[:w.lines.count]
+        cost = self.cost()
+        for _ in range(iterations):
+            self.linearise(use_p, use_l, self._damping)
+            before = self._save()
+            if not self._step(use_p, use_l):
+                self._damping = min(max(10.0 * self._damping, 1e-4), 1e4)
+                continue
+            new_cost = self.cost()
+            if new_cost < cost:
+                self._damping = max(0.1 * self._damping, 1e-9)
+                done, cost = cost - new_cost < CONVERGED * cost, new_cost
+                if done:
+                    return cost
+            else:
+                self._restore(before)
+                self._damping = min(max(10.0 * self._damping, 1e-4), 1e4)
+        return self.cost()
+
+    def _step(self, use_p, use_l) -> bool:
+        w, dim = self.window, STATE * self.window.n
+        H = self.H[:dim, :dim].copy()
+        H[np.arange(dim), np.arange(dim)] *= 1.0 + self._damping
+        try:
+            dx = -cho_solve(cho_factor(H, lower=True, check_finite=False), self.g[:dim], check_finite=False)
+        except LinAlgError:
+            return False
+        back_substitute(w.n, use_p, w.points.seen, 3, self._E_p, self._A_p, self._a_p, dx, self._step_p)
+        back_substitute(w.n, use_l, w.lines.seen, 4, self._E_l, self._A_l, self._a_l, dx, self._step_l)
+        retract_states(w.n, w.R, w.p, w.v, w.b, dx)
+        retract_landmarks(use_p, w.points.abr, self._step_p, use_l, self.options.host_lines,
+                          w.lines.U, w.lines.phi, w.lines.rho, self._step_l)
+        return True
+
+    def _save(self) -> list[np.ndarray]:
+        w = self.window
+        return [a[:k].copy() for a, k in self._variables(w)]
+
+    def _restore(self, saved: list[np.ndarray]) -> None:
+        for (a, k), s in zip(self._variables(self.window), saved, strict=True):
+            a[:k] = s
+
+    @staticmethod
+    def _variables(w: Window) -> list[tuple[np.ndarray, int]]:
+        n, p, q = w.n, w.points.count, w.lines.count
+        return [(w.R, n), (w.p, n), (w.v, n), (w.b, n), (w.points.abr, p), (w.lines.U, q), (w.lines.phi, q),
+                (w.lines.rho, q)]
+
+    def covariance(self, slot: int) -> F64:
+        """(15, 15) of one state given everything in the window; needs a fresh linearise."""
+        dim, o = STATE * self.window.n, STATE * slot
+        rhs = np.zeros((dim, STATE))
+        rhs[o:o + STATE] = np.eye(STATE)
+        factor = cho_factor(self.H[:dim, :dim] + 1e-9 * np.eye(dim), lower=True, check_finite=False)
+        return cho_solve(factor, rhs, check_finite=False)[o:o + STATE]
+
+    def line_covariances(self, rows: np.ndarray) -> F64:
+        """(L, 4, 4) of lines in their tangent, the states held fixed; needs a fresh linearise."""
+        return self._A_l[rows]

@@ -1,0 +1,55 @@
+"""Whether the body is at rest, from bearings and inertial samples."""
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from line_slam_ros.estimation.initialisation import matches
+from line_slam_ros.types import F64, Observations, Samples
+
+SPAN_S = 0.5  # motion is judged over this long
+MAX_SHIFT_PX = 0.4  # median corner shift over the span beyond noise; 1 cm/s at 5 m and 450 px
+RAYLEIGH_MEDIAN = 1.67  # median distance of two noisy sightings of one corner, standard deviations of one
+MIN_MATCHES = 15
+MAX_GYRO_STD, MAX_ACCEL_STD = 0.05, 0.5  # rad/s, m/s^2: a body that shakes is not still
+
+
+class Stillness:
+    """Remembers half a second of frames."""
+
+    def __init__(self, focal_px: float, point_sigma_px: float):
+        self._max_shift = np.hypot(MAX_SHIFT_PX, RAYLEIGH_MEDIAN * point_sigma_px) / focal_px
+        self._past: deque[tuple[Observations, Samples | None]] = deque()
+        self._rest: Observations | None = None  # the frame since which nothing moved: creeping adds up against it
+
+    def clear(self) -> None:
+        self._past.clear()
+        self._rest = None
+
+    def add(self, observations: Observations, samples: Samples | None) -> bool:
+        """Take the newest frame and the samples that led to it; True when nothing moved over the whole span."""
+        self._past.append((observations, samples))
+        while len(self._past) > 2 and observations.t_ns - self._past[1][0].t_ns >= SPAN_S * 1e9:
+            self._past.popleft()
+        first = self._past[0][0]
+        if observations.t_ns - first.t_ns < SPAN_S * 1e9:
+            return False
+        if self._moved(first, observations) or (self._rest and self._moved(self._rest, observations)):
+            self._rest = None
+            return False
+        gyro, accel = (np.concatenate([s[i] for _, s in list(self._past)[1:] if s is not None]) for i in (1, 2))
+        if gyro.std(axis=0).max() > MAX_GYRO_STD or accel.std(axis=0).max() > MAX_ACCEL_STD:
+            self._rest = None
+            return False
+        self._rest = self._rest or observations
+        return True
+
+    def _moved(self, then: Observations, now: Observations) -> bool:
+        a, b = matches(then, now)
+        return len(a) < MIN_MATCHES or bool(np.median(np.linalg.norm(b - a, axis=1)) > self._max_shift)
+
+    def mean_imu(self) -> tuple[F64, F64]:
+        """Mean rate (3,) and specific force (3,) over the span."""
+        return tuple(np.mean(np.concatenate([s[i] for _, s in list(self._past)[1:] if s is not None]), axis=0)
+                     for i in (1, 2))  # type: ignore[return-value]

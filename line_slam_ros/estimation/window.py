@@ -1,0 +1,185 @@
+"""What the optimiser works on: states of the sliding window, their inertial links, landmark tables and the prior.
+
+Structure of arrays, allocated once; slot 0 is the oldest state, slot n - 1 the newest.
+"""
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from line_slam_ros.geometry.imu import preintegrate
+from line_slam_ros.geometry.lie_kernels import log_so3, multiply_transposed
+from line_slam_ros.types import F64, I64, ImuNoise, Samples
+
+STATE = 15  # [rotation, position, velocity, gyro bias, accelerometer bias]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def state_difference(n, R, p, v, b, R0, p0, v0, b0, delta):
+    """delta (15 n,) = present state minus first estimate, rotation as Log(R0' R)."""
+    E = np.empty((3, 3))
+    for k in range(n):
+        o = STATE * k
+        multiply_transposed(R0[k], R[k], E)
+        log_so3(E, delta[o:o + 3])
+        for i in range(3):
+            delta[o + 3 + i] = p[k, i] - p0[k, i]
+            delta[o + 6 + i] = v[k, i] - v0[k, i]
+        for i in range(6):
+            delta[o + 9 + i] = b[k, i] - b0[k, i]
+
+
+class LandmarkTable:
+    """Landmarks of one kind by row and their observations by (row, slot).
+
+    ``fields`` are extra columns: name -> (trailing shape). Rows are dense: [0, count).
+    """
+
+    def __init__(self, rows: int, slots: int, observation: tuple[int, ...], fields: dict[str, tuple[int, ...]]):
+        self.count = 0
+        self.ids = np.full(rows, -1, np.int64)
+        self.seen = np.zeros((rows, slots), np.bool_)
+        self.z = np.zeros((rows, slots, *observation))  # normalised image coordinates
+        self.sigma = np.ones((rows, slots, 2))  # their standard deviation
+        self.solved = np.zeros(rows, np.bool_)  # has a 3D estimate and takes part in the optimisation
+        self.views = np.zeros(rows, np.int64)  # keyframes that ever saw it, also those that left the window
+        self._columns = ['ids', 'seen', 'z', 'sigma', 'solved', 'views', *fields]
+        for name, shape in fields.items():
+            setattr(self, name, np.zeros((rows, *shape)))
+
+    def observe(self, slot: int, ids: I64, z: F64, sigma: F64) -> None:
+        """Write one frame's observations (N, ...) into a slot; unknown ids get new rows while there is room."""
+        known = self.ids[:self.count]
+        order = np.argsort(known, kind='stable')
+        at = np.searchsorted(known, ids, sorter=order)
+        at_clipped = np.minimum(at, max(self.count - 1, 0))
+        rows = order[at_clipped] if self.count else np.zeros(len(ids), np.int64)
+        new = known[rows] != ids if self.count else np.ones(len(ids), np.bool_)
+        room = len(self.ids) - self.count
+        fresh = np.flatnonzero(new)[:room]
+        rows = np.where(new, -1, rows)
+        rows[fresh] = self.count + np.arange(len(fresh))
+        self._clear_rows(self.count, self.count + len(fresh))
+        self.ids[rows[fresh]] = ids[fresh]
+        self.count += len(fresh)
+        used = rows >= 0
+        self.seen[rows[used], slot], self.z[rows[used], slot], self.sigma[rows[used], slot] = True, z[used], sigma[used]
+
+    def _clear_rows(self, first: int, last: int) -> None:
+        self.seen[first:last], self.solved[first:last], self.views[first:last] = False, False, 0
+
+    def remove_slot(self, slot: int, slots: int) -> None:
+        """Forget what a slot saw and close the gap; slots = number of slots in use before."""
+        for a in (self.seen, self.z, self.sigma):
+            a[:self.count, slot:slots - 1] = a[:self.count, slot + 1:slots]
+        self.seen[:self.count, slots - 1] = False
+
+    def keep(self, mask: np.ndarray) -> None:
+        """Drop the rows where mask (count,) is False."""
+        kept = np.flatnonzero(mask)
+        for name in self._columns:
+            a = getattr(self, name)
+            a[:len(kept)] = a[kept]
+        self.count = len(kept)
+
+
+class Window:
+    """States, links, landmarks and prior; knows how to add, drop and shift, not how to optimise."""
+
+    def __init__(self, slots: int, noise: ImuNoise, max_points: int, max_lines: int):
+        self.slots, self.noise, self.n = slots, noise, 0
+        self.t_ns = np.zeros(slots, np.int64)
+        self.R, self.p, self.v, self.b = (np.zeros((slots, *s)) for s in ((3, 3), (3,), (3,), (6,)))
+        # first estimates: Jacobians of frozen states are taken here, so that the prior's null space survives
+        self.R0, self.p0, self.v0, self.b0 = (np.zeros_like(a) for a in (self.R, self.p, self.v, self.b))
+        self.frozen = np.zeros(slots, np.bool_)
+        self.still = np.zeros(slots, np.bool_)  # the body did not move: velocity is measured as zero
+        # link k: slot k -> k + 1
+        self.dt = np.zeros(slots)
+        self.dR, self.dp, self.dv = np.zeros((slots, 3, 3)), np.zeros((slots, 3)), np.zeros((slots, 3))
+        self.J_b, self.cov, self.W = np.zeros((slots, 9, 6)), np.zeros((slots, 9, 9)), np.zeros((slots, 9, 9))
+        self.w_b, self.b_lin = np.zeros((slots, 6)), np.zeros((slots, 6))
+        self.samples: list[Samples] = []  # raw t (s), gyro, accel of each link
+        self.prior_H, self.prior_g = np.zeros((STATE * slots, STATE * slots)), np.zeros(STATE * slots)
+        self.points = LandmarkTable(max_points, slots, (2,), {'abr': (3,), 'R_WA': (3, 3), 'p_WA': (3,)})
+        self.lines = LandmarkTable(max_lines, slots, (2, 2), {'U': (3, 3), 'phi': (), 'rho': (), 'origin': (3,)})
+
+    def clear(self) -> None:
+        """Back to an empty window."""
+        self.n, self.points.count, self.lines.count = 0, 0, 0
+        self.samples.clear()
+        self.prior_H[:], self.prior_g[:] = 0.0, 0.0
+
+    def append(self, t_ns: int, R: F64, p: F64, v: F64, b: F64, samples: Samples | None) -> int:
+        """Add the newest state; samples are those since the previous one (None for the first). Returns its slot."""
+        k = self.n
+        self.t_ns[k], self.R[k], self.p[k], self.v[k], self.b[k] = t_ns, R, p, v, b
+        self.frozen[k] = self.still[k] = False
+        if k:
+            assert samples is not None
+            self.samples.append(samples)
+            self.integrate(k - 1)
+        self.n += 1
+        return k
+
+    def integrate(self, link: int) -> None:
+        """(Re)integrate a link's samples about the present bias of its first state."""
+        t, gyro, accel = self.samples[link]
+        self.b_lin[link] = self.b[link]
+        self.dt[link] = preintegrate(t, gyro, accel, self.b_lin[link, :3], self.b_lin[link, 3:],
+                                     self.noise.gyro_density**2, self.noise.accel_density**2, self.dR[link],
+                                     self.dp[link], self.dv[link], self.J_b[link], self.cov[link])
+        self.W[link] = np.linalg.inv(np.linalg.cholesky(self.cov[link] + 1e-14 * np.eye(9)))
+        self.w_b[link] = 1.0 / (np.repeat([self.noise.gyro_walk, self.noise.accel_walk], 3) * np.sqrt(self.dt[link]))
+
+    def freeze(self, slots: np.ndarray) -> None:
+        """Fix the linearisation point of states the prior is about to know."""
+        for k in slots:
+            if not self.frozen[k]:
+                self.frozen[k] = True
+                self.R0[k], self.p0[k], self.v0[k], self.b0[k] = self.R[k], self.p[k], self.v[k], self.b[k]
+
+    def recentre_prior(self) -> None:
+        """Move every first estimate to the present state and the prior along; rotations to first order."""
+        dim = STATE * self.n
+        delta = np.empty(dim)
+        state_difference(self.n, self.R, self.p, self.v, self.b, self.R0, self.p0, self.v0, self.b0, delta)
+        delta.reshape(-1, STATE)[~self.frozen[:self.n]] = 0.0
+        self.prior_g[:dim] += self.prior_H[:dim, :dim] @ delta
+        for first, now in ((self.R0, self.R), (self.p0, self.p), (self.v0, self.v), (self.b0, self.b)):
+            first[:self.n] = now[:self.n]
+
+    def unfrozen_to_current(self) -> None:
+        """States no prior knows are linearised where they are."""
+        free = np.flatnonzero(~self.frozen[:self.n])
+        for first, now in ((self.R0, self.R), (self.p0, self.p), (self.v0, self.v), (self.b0, self.b)):
+            first[free] = now[free]
+
+    def remove(self, slot: int) -> None:
+        """Take a state out and close the gap; the links before and after it become one."""
+        n = self.n
+        if 0 < slot < n - 1:
+            (t1, g1, a1), (t2, g2, a2) = self.samples[slot - 1:slot + 1]
+            merged = np.concatenate([t1, t1[-1] + t2[1:]]), np.concatenate([g1, g2[1:]]), np.concatenate([a1, a2[1:]])
+            self.samples[slot - 1:slot + 1] = [merged]
+        elif self.samples:
+            del self.samples[0 if slot == 0 else -1]
+        for a in (self.t_ns, self.R, self.p, self.v, self.b, self.R0, self.p0, self.v0, self.b0, self.frozen,
+                  self.still):
+            a[slot:n - 1] = a[slot + 1:n]
+        for a in (self.dt, self.dR, self.dp, self.dv, self.J_b, self.cov, self.W, self.w_b, self.b_lin):
+            a[slot:n - 2] = a[slot + 1:n - 1]
+        for table in (self.points, self.lines):
+            table.remove_slot(slot, n)
+        self._remove_from_prior(slot)
+        self.n = n - 1
+        if 0 < slot < n - 1:
+            self.integrate(slot - 1)
+
+    def _remove_from_prior(self, slot: int) -> None:
+        lo, hi, end = STATE * slot, STATE * (slot + 1), STATE * self.n
+        H, g = self.prior_H, self.prior_g
+        H[lo:end - STATE, :end] = H[hi:end, :end].copy()
+        H[:end, lo:end - STATE] = H[:end, hi:end].copy()
+        g[lo:end - STATE] = g[hi:end].copy()
+        H[end - STATE:end, :end], H[:end, end - STATE:end], g[end - STATE:end] = 0.0, 0.0, 0.0

@@ -1,0 +1,216 @@
+"""Camera models: pixels of the received image <-> normalised, undistorted coordinates on the plane z = 1.
+
+radtan (Brown-Conrady; ROS plumb_bob, rational_polynomial), with r^2 = x.x:
+
+    x_d = g x + [2 p1 x y + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 x y],
+    g   = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
+
+equidistant (Kannala-Brandt; OpenCV fisheye), with theta = atan r:
+
+    x_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) x / r
+
+Both are used only where the radius of x_d grows with that of x: beyond, two rays share a pixel and the result is NaN.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.polynomial import Polynomial
+from numpy.typing import NDArray
+
+from line_slam_ros.types import F64, Calibration
+
+WIDEST_CANVAS = 1.25  # of the received image, on each side of the principal point
+NEWTON_STEPS = 20
+CONVERGED = 1e-8  # last Newton step, normalised units; what is left is about its square
+
+
+@dataclass(frozen=True, slots=True)
+class Rectification:
+    """A pinhole image without distortion and how to make it: cv2.remap(image, map1, map2, cv2.INTER_LINEAR)."""
+
+    map1: NDArray[np.int16]  # (H, W, 2)
+    map2: NDArray[np.uint16]  # (H, W)
+    fx: float  # px
+    fy: float
+    cx: float
+    cy: float
+    size: tuple[int, int]  # W, H px
+
+    def normalise(self, uv: F64) -> F64:
+        """Pixels (..., 2) of the rectified image to normalised coordinates (..., 2)."""
+        return (np.asarray(uv, float) - (self.cx, self.cy)) / (self.fx, self.fy)
+
+    def project(self, x: F64) -> F64:
+        """Normalised coordinates (..., 2) to pixels (..., 2) of the rectified image."""
+        return np.asarray(x, float) * (self.fx, self.fy) + (self.cx, self.cy)
+
+
+class Camera:
+    """One calibrated camera. Raises ValueError when the calibration cannot be used, saying what to do."""
+
+    def __init__(self, calibration: Calibration) -> None:
+        _check(calibration)
+        self.calibration = calibration
+        fx, fy, cx, cy = calibration.intrinsics
+        self._focals, self._centre = np.array([fx, fy]), np.array([cx, cy])
+        self._lens: _Lens = MODELS[calibration.model](np.array(calibration.distortion, float))
+
+    @property
+    def focal(self) -> float:
+        """Mean focal length, px."""
+        return float(self._focals.mean())
+
+    def normalise(self, uv: F64) -> F64:
+        """Pixels (N, 2) to undistorted normalised coordinates (N, 2); NaN where the model has no inverse."""
+        with np.errstate(invalid='ignore', over='ignore', divide='ignore'):
+            return self._lens.undistort((np.asarray(uv, float) - self._centre) / self._focals)
+
+    def project(self, x: F64) -> F64:
+        """Normalised coordinates (N, 2) to pixels (N, 2); NaN outside the region where the model is one to one."""
+        with np.errstate(invalid='ignore', over='ignore', divide='ignore'):
+            return self._lens.distort(np.asarray(x, float)) * self._focals + self._centre
+
+    def rectified(self, scale: float = 1.0) -> Rectification:
+        """The pinhole canvas with focal length * scale that keeps the field of view, up to WIDEST_CANVAS per side."""
+        (left, top), (right, bottom) = (reach * scale for reach in self._reach())
+        fx, fy = self._focals * scale
+        v, u = np.mgrid[: round(top + bottom) + 1, : round(left + right) + 1]
+        uv = self.project(np.stack([(u - left) / fx, (v - top) / fy], axis=-1).reshape(-1, 2))
+        outside = -2.0  # px; far enough from the image that interpolation does not touch it
+        limit = np.array([self.calibration.width, self.calibration.height]) + 1.0
+        uv = np.clip(np.nan_to_num(uv, nan=outside), outside, limit).astype(np.float32).reshape(*u.shape, 2)
+        map1, map2 = cv2.convertMaps(uv[..., 0], uv[..., 1], cv2.CV_16SC2)
+        return Rectification(map1, map2, float(fx), float(fy), float(left), float(top), (u.shape[1], u.shape[0]))
+
+    def _reach(self) -> tuple[F64, F64]:
+        """Field of view in rectified px from the principal point: ([left, top], [right, bottom])."""
+        width, height = self.calibration.width, self.calibration.height
+        u, v = np.linspace(0.0, width - 1.0, 64), np.linspace(0.0, height - 1.0, 64)
+
+        def furthest(edge_u: F64 | float, edge_v: F64 | float, axis: int) -> float:
+            x = self.normalise(np.column_stack(np.broadcast_arrays(edge_u, edge_v)))[:, axis]
+            return float(np.max(np.nan_to_num(np.abs(x), nan=np.inf)) * self._focals[axis])  # NaN: past any canvas
+
+        low = np.array([furthest(0.0, v, 0), furthest(u, 0.0, 1)])
+        high = np.array([furthest(width - 1.0, v, 0), furthest(u, height - 1.0, 1)])
+        limit = WIDEST_CANVAS * self._centre, WIDEST_CANVAS * (np.array([width, height]) - self._centre)
+        return np.minimum(low, limit[0]), np.minimum(high, limit[1])
+
+
+class _Lens(Protocol):
+    """Distortion of the normalised plane."""
+
+    def distort(self, x: F64) -> F64:
+        """(N, 2) to (N, 2)."""
+
+    def undistort(self, x_d: F64) -> F64:
+        """(N, 2) to (N, 2)."""
+
+
+class _Radtan:
+    """k1 k2 p1 p2 [k3 [k4 k5 k6]]; see the module."""
+
+    def __init__(self, coefficients: F64) -> None:
+        self._coefficients = k1, k2, _, _, k3, k4, k5, k6 = np.pad(coefficients, (0, 8 - len(coefficients))).tolist()
+        s, over, under = Polynomial([0.0, 1.0]), Polynomial([1.0, k1, k2, k3]), Polynomial([1.0, k4, k5, k6])
+        growth = over * under + 2.0 * s * (over.deriv() * under - over * under.deriv())  # d(g r)/dr times under^2
+        self._widest = np.sqrt(min(_first_positive_root(growth), _first_positive_root(under)))
+        self._table = np.linspace(0.0, min(self._widest, 10.0), 1024)
+        self._table_d = self._table * over(self._table**2) / under(self._table**2)
+
+    def _bend(self, x: F64, y: F64) -> tuple[F64, F64, F64, F64, F64]:
+        """Distorted x, y and the symmetric derivative dx_d/dx, dx_d/dy = dy_d/dx, dy_d/dy, all (N,)."""
+        k1, k2, p1, p2, k3, k4, k5, k6 = self._coefficients
+        s = x * x + y * y
+        under = 1.0 + s * (k4 + s * (k5 + s * k6))
+        gain = (1.0 + s * (k1 + s * (k2 + s * k3))) / under
+        slope = (k1 + s * (2.0 * k2 + 3.0 * s * k3) - gain * (k4 + s * (2.0 * k5 + 3.0 * s * k6))) / under  # dg/ds
+        return (gain * x + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x),
+                gain * y + 2.0 * p2 * x * y + p1 * (s + 2.0 * y * y),
+                gain + 2.0 * slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x,
+                2.0 * slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y,
+                gain + 2.0 * slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x)
+
+    def distort(self, x: F64) -> F64:
+        inside = np.sum(x * x, axis=-1, keepdims=True) < self._widest**2
+        return np.where(inside, np.column_stack(self._bend(*x.T)[:2]), np.nan)
+
+    def undistort(self, x_d: F64) -> F64:
+        """Newton's method from the inverse of the radial part; NaN where it does not converge in the valid region."""
+        r_d = np.linalg.norm(x_d, axis=-1)
+        x, y = x_d.T * np.interp(r_d, self._table_d, self._table) / np.where(r_d == 0.0, 1.0, r_d)
+        for _ in range(NEWTON_STEPS):
+            bent_x, bent_y, xx, xy, yy = self._bend(x, y)
+            error_x, error_y, determinant = bent_x - x_d[:, 0], bent_y - x_d[:, 1], xx * yy - xy * xy
+            step_x = (yy * error_x - xy * error_y) / determinant
+            step_y = (xx * error_y - xy * error_x) / determinant
+            x, y, step = x - step_x, y - step_y, np.abs(step_x) + np.abs(step_y)
+            if not np.any(step > CONVERGED):
+                break
+        found = (step <= CONVERGED) & (determinant > 0.0) & (x * x + y * y < self._widest**2)
+        return np.where(found[:, None], np.column_stack([x, y]), np.nan)
+
+
+class _Equidistant:
+    """k1 k2 k3 k4; see the module."""
+
+    def __init__(self, coefficients: F64) -> None:
+        odd = np.zeros(10)
+        odd[1::2] = [1.0, *coefficients]
+        self._angle_d = Polynomial(odd)  # of theta
+        self._growth = self._angle_d.deriv()
+        self._widest = min(_first_positive_root(self._growth), np.pi / 2.0)
+        self._table = np.linspace(0.0, self._widest, 1024)
+        self._table_d = self._angle_d(self._table)
+
+    def distort(self, x: F64) -> F64:
+        r = np.linalg.norm(x, axis=-1, keepdims=True)
+        angle = np.where(np.arctan(r) < self._widest, np.arctan(r), np.nan)
+        return x * np.where(r == 0.0, 1.0, self._angle_d(angle) / r)
+
+    def undistort(self, x_d: F64) -> F64:
+        """Newton's method on the angle; NaN at and beyond 90 degrees, where the plane z = 1 ends."""
+        r_d = np.linalg.norm(x_d, axis=-1, keepdims=True)
+        angle = np.interp(r_d, self._table_d, self._table)
+        for _ in range(NEWTON_STEPS):
+            step = (self._angle_d(angle) - r_d) / self._growth(angle)
+            angle = angle - step
+            if not np.any(np.abs(step) > CONVERGED):
+                break
+        angle = np.where((np.abs(step) <= CONVERGED) & (angle < self._widest), angle, np.nan)
+        return x_d * np.where(r_d == 0.0, 1.0, np.tan(angle) / r_d)
+
+
+MODELS = {'radtan': _Radtan, 'equidistant': _Equidistant}
+COEFFICIENTS = {'radtan': (0, 4, 5, 8), 'equidistant': (4,)}
+
+
+def _first_positive_root(polynomial: Polynomial) -> float:
+    """Smallest positive real root, or infinity; of a polynomial with constant term 1, solved for the reciprocals."""
+    reciprocals = Polynomial(polynomial.coef[::-1]).roots()
+    positive = reciprocals.real[(np.abs(reciprocals.imag) < 1e-9) & (reciprocals.real > 1e-6)]
+    return float(1.0 / np.max(positive)) if len(positive) else np.inf
+
+
+def _check(calibration: Calibration) -> None:
+    """Raise ValueError naming the value and the remedy."""
+    model, distortion = calibration.model, calibration.distortion
+    if model not in MODELS:
+        raise ValueError(f'unknown distortion model {model!r}: recalibrate with one of {", ".join(MODELS)} '
+                         '(ROS: plumb_bob, rational_polynomial, equidistant or fisheye)')
+    if len(distortion) not in COEFFICIENTS[model]:
+        raise ValueError(f'{model} takes {" or ".join(map(str, COEFFICIENTS[model]))} distortion coefficients, '
+                         f'got {len(distortion)}: {tuple(distortion)}')
+    if not np.all(np.isfinite([*calibration.intrinsics, *distortion])):
+        raise ValueError(f'intrinsics {calibration.intrinsics} or distortion {tuple(distortion)} are not finite: '
+                         'calibrate the camera')
+    if not min(calibration.intrinsics[:2]) > 0.0:
+        raise ValueError(f'focal lengths must be positive, got {calibration.intrinsics[:2]} px: the camera is not '
+                         'calibrated; calibrate it and publish its camera_info, or give a Kalibr file')
+    if not min(calibration.width, calibration.height) > 0:
+        raise ValueError(f'image size must be positive, got {calibration.width} x {calibration.height} px: '
+                         'set the width and height of the calibration')

@@ -1,0 +1,161 @@
+"""Everything the node publishes about the world: what is made, how often, and only if somebody listens."""
+from __future__ import annotations
+
+from typing import Any
+
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import serialize_message
+
+from line_slam_ros.shell_config import ShellConfig
+from line_slam_ros.types import F64, U8, Estimate, LineSegments
+from msg_adapters import outputs
+from msg_adapters.factories import ros_messages
+from msg_adapters.marker_bytes import LineListBytes
+
+PATH_POSES = 500  # a path never grows beyond; with more, every second pose is forgotten
+PATH_STEP_NS = 100_000_000
+
+
+class Publishers:
+    """``~/odometry``, ``~/pose``, ``~/path``, ``~/lines``, ``~/points``, ``~/image_lines`` and ``/tf``.
+
+    Called by the worker thread; only the late joiner of ``~/lines`` is served from the executor's.
+    """
+
+    def __init__(self, node: Node, shell: ShellConfig) -> None:
+        self._new = ros_messages()
+        self._shell = shell
+        self._path = DecimatedPath()
+        self._node = node
+        self._odometry = self._advertise('nav_msgs/msg/Odometry', '~/odometry', 10)
+        self._pose = self._advertise('geometry_msgs/msg/PoseWithCovarianceStamped', '~/pose', 10)
+        self._trajectory = self._advertise('nav_msgs/msg/Path', '~/path', 1)
+        self._points = self._advertise('sensor_msgs/msg/PointCloud2', '~/points', 1)
+        self._image = self._advertise('sensor_msgs/msg/Image', '~/image_lines', 1)
+        latched = QoSProfile(depth=2, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # the last pair: map and active
+        self._lines = node.create_publisher(self._new.type('visualization_msgs/msg/Marker'), '~/lines', latched,
+                                            event_callbacks=PublisherEventCallbacks(matched=self._on_lines_matched))
+        self._map_bytes = self._line_list('map', outputs.MAP_COLOUR)
+        self._active_bytes = self._line_list('active', outputs.ACTIVE_COLOUR)
+        self._newest_lines: tuple[bytes, bytes] | None = None
+        self._tf = self._advertise_tf()
+        self.map_due = Rate(shell.node.map_rate)
+        self._path_due = Rate(shell.node.path_rate)
+        self._image_due = Rate(shell.node.image_rate)
+
+    def estimate(self, estimate: Estimate, gyro_variance: float) -> None:
+        """Odometry, pose, path and transform, all with the image's stamp; gyro_variance in rad^2/s^2."""
+        odom, body = self._shell.odom_frame, self._shell.body_frame
+        if self._tf is not None:
+            moved = outputs.transform(self._new, estimate.t_ns, estimate.T_WB, odom, body)
+            self._tf.publish(outputs.tf(self._new, [moved]))
+        if heard(self._odometry):
+            self._odometry.publish(outputs.odometry(self._new, estimate, odom, body, gyro_variance))
+        if heard(self._pose):
+            self._pose.publish(outputs.pose(self._new, estimate, odom))
+        if self._path.due(estimate.t_ns):
+            self._path.add(estimate.t_ns, outputs.pose_stamped(self._new, estimate.t_ns, estimate.T_WB, odom))
+        if heard(self._trajectory) and self._path_due(estimate.t_ns):
+            self._trajectory.publish(outputs.path_of(self._new, self._path.poses, estimate.t_ns, odom))
+
+    def lines(self, t_ns: int, whole: LineSegments, active: LineSegments) -> None:
+        """Two markers: the whole map, and on top of it, thicker, the lines of the window. Kept for late joiners."""
+        self._newest_lines = (self._map_bytes(t_ns, whole.ends.reshape(-1, 3)),
+                              self._active_bytes(t_ns, active.ends.reshape(-1, 3)))
+        if heard(self._lines):
+            self._publish_lines()
+
+    def points(self, t_ns: int, points_W: F64) -> None:
+        """Landmarks (N, 3) in W."""
+        self._points.publish(outputs.points_cloud(self._new, points_W, t_ns, self._shell.odom_frame))
+
+    @property
+    def points_wanted(self) -> bool:
+        return heard(self._points)
+
+    def image_wanted(self, t_ns: int) -> bool:
+        """Whether somebody listens to ``~/image_lines`` and the next one is due."""
+        return heard(self._image) and self._image_due(t_ns)
+
+    def image(self, t_ns: int, bgr: U8) -> None:
+        """Debug image (H, W, 3); its frame is the camera's, which messages do not need to name."""
+        self._image.publish(outputs.image(self._new, bgr, t_ns, ''))
+
+    def reset(self, t_ns: int) -> None:
+        """Forgets the path and shows an empty map."""
+        self._path = DecimatedPath()
+        for due in (self.map_due, self._path_due, self._image_due):
+            due.reset()
+        self.lines(t_ns, LineSegments.empty(), LineSegments.empty())
+
+    def _publish_lines(self) -> None:
+        for marker in self._newest_lines or ():
+            self._lines.publish(marker)
+
+    def _on_lines_matched(self, info: Any) -> None:
+        """DDS gives a late joiner what was last sent, perhaps long ago as nobody listened: send the newest."""
+        if info.current_count_change > 0:
+            self._publish_lines()
+
+    def _advertise(self, type_name: str, topic: str, depth: int) -> Publisher:
+        return self._node.create_publisher(self._new.type(type_name), topic, depth)
+
+    def _advertise_tf(self) -> Publisher | None:
+        try:
+            return self._advertise('tf2_msgs/msg/TFMessage', '/tf', 100)
+        except ImportError:
+            self._node.get_logger().warning('tf2_msgs is not installed: /tf is not published, the rest is')
+            return None
+
+    def _line_list(self, namespace: str, colour: outputs.Colour) -> LineListBytes:
+        width = self._shell.node.line_width * (1.5 if namespace == 'active' else 1.0)
+        marker = outputs.lines_marker(self._new, LineSegments.empty().ends, 0, self._shell.odom_frame, namespace,
+                                      colour, width)
+        return LineListBytes(marker, self._new('geometry_msgs/msg/Point'), serialize_message)
+
+
+class Rate:
+    """At most so many a second, in sensor time."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._period_ns = int(1e9 / rate_hz)
+        self.reset()
+
+    def __call__(self, t_ns: int) -> bool:
+        due = t_ns >= self._next
+        if due:
+            self._next = t_ns + self._period_ns
+        return due
+
+    def reset(self) -> None:
+        """Time may have jumped: the next one is due."""
+        self._next = -2**63
+
+
+class DecimatedPath:
+    """Poses (messages) of the whole way in bounded memory: when full, every second one goes and the step doubles."""
+
+    def __init__(self) -> None:
+        self.poses: list[Any] = []
+        self._step_ns = PATH_STEP_NS
+        self._next = -2**63
+
+    def due(self, t_ns: int) -> bool:
+        """Whether the next pose is far enough from the last."""
+        return t_ns >= self._next
+
+    def add(self, t_ns: int, pose: Any) -> None:
+        """Appends a pose and thins the path when it is full."""
+        self.poses.append(pose)
+        if len(self.poses) >= PATH_POSES:
+            self.poses = self.poses[::2]
+            self._step_ns *= 2
+        self._next = t_ns + self._step_ns
+
+
+def heard(publisher: Publisher) -> bool:
+    """Whether anybody subscribes."""
+    return publisher.get_subscription_count() > 0

@@ -1,0 +1,169 @@
+"""The whole method on one screen."""
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from line_slam_ros.config import Config
+from line_slam_ros.estimation.bootstrap import Bootstrap
+from line_slam_ros.estimation.estimator import Estimator
+from line_slam_ros.estimation.stillness import Stillness
+from line_slam_ros.frontend.front_end import FrontEnd
+from line_slam_ros.geometry.camera import Camera
+from line_slam_ros.geometry.imu import between
+from line_slam_ros.geometry.lie import so3_exp
+from line_slam_ros.mapping.line_map import LineMap
+from line_slam_ros.types import (
+    F64,
+    I64,
+    Calibration,
+    Estimate,
+    Frame,
+    ImuBatch,
+    LineSegments,
+    Observations,
+    Samples,
+    Status,
+)
+from line_slam_ros.warm_up import warm_up_estimator, warm_up_front_end
+
+
+class Slam:
+    """Frames and inertial samples in, estimates and a line map out."""
+
+    def __init__(self, config: Config, calibration: Calibration):
+        self.config, self.calibration = config, calibration
+        self.camera = Camera(calibration)
+        self.front_end = FrontEnd(self.camera, config)
+        self.line_map = LineMap(config.mapping)
+        focal = self.camera.focal
+        self.estimator = Estimator(config.estimator, calibration, focal, config.points.max_count,
+                                   config.lines.max_count)
+        self._bootstrap = Bootstrap(self.estimator, calibration)
+        self._stillness = Stillness(focal, config.estimator.point_sigma_px)
+        self.status, self.waiting_for, self.resets = Status.INITIALISING, 'first image', 0
+        self.timings: dict[str, float] = {}
+        self._last_ns: int | None = None
+        self._mapped = np.empty(0, np.int64)
+
+    def warm_up(self) -> None:
+        """Compile every kernel, or load it from the cache, on throwaway copies fed with a simulated second."""
+        warm_up_front_end(FrontEnd(self.camera, self.config), self.calibration)
+        warm_up_estimator(self.config.estimator)
+        LineMap.warm_up(self.config.mapping)
+
+    def process(self, frame: Frame, imu: ImuBatch) -> Estimate | None:
+        """One frame and the inertial samples since the previous one; None until initialised and while lost.
+
+        Raises ValueError for a frame that is not newer than the last, that no inertial sample
+        accompanies, or whose size is not the camera's.
+        """
+        self.timings = {}
+        with self._timed('total'):
+            samples = None if self._last_ns is None else between(imu, self._last_ns, frame.t_ns)
+            with self._timed('track'):
+                observations = self.front_end.track(frame, self._camera_rotation(samples))
+            self._last_ns = frame.t_ns
+            still = self._stillness.add(observations, samples)
+            if self.status is not Status.TRACKING or samples is None:
+                return self._initialise(observations, samples, still)
+            with self._timed('optimise'):
+                outliers = self.estimator.step(observations, samples, still)
+                self.front_end.forget(*outliers)
+                self._drop(outliers[1])
+            if self.estimator.failure:
+                return self._lose(self.estimator.failure)
+            estimate = self._estimate(samples)
+            if estimate.is_keyframe and self.config.use_lines:
+                with self._timed('map'):
+                    self._map()
+            with self._timed('marginalise'):
+                self.estimator.marginalise()
+            return estimate
+
+    def reset(self, reason: str) -> None:
+        """Start anew: time, map and origin."""
+        self.resets += 1
+        self.status, self.waiting_for = Status.INITIALISING, reason
+        self._forget()
+        self._bootstrap.anchor = np.zeros(3), 0.0
+        self.line_map.clear()
+        self._last_ns = None
+
+    def active_lines(self) -> LineSegments:
+        """The lines the window sees now."""
+        return self.line_map.active()
+
+    def points(self) -> F64:
+        """Landmarks (N, 3) of the window in W."""
+        return self.estimator.points()
+
+    def _initialise(self, observations: Observations, samples: Samples | None, still: bool) -> Estimate | None:
+        with self._timed('initialise'):
+            started = self._bootstrap.add(observations, samples, self._stillness.mean_imu() if still else None)
+        self.waiting_for = self._bootstrap.waiting_for
+        if not started or samples is None:
+            return None
+        self.status, self.waiting_for = Status.TRACKING, ''
+        return self._estimate(samples)
+
+    def _lose(self, reason: str) -> None:
+        self.resets += 1
+        self.status, self.waiting_for = Status.LOST, f'a new start, lost: {reason}'
+        self._forget()
+
+    def _forget(self) -> None:
+        """Drop the window but not the map; the next start continues where it ended."""
+        self._bootstrap.anchor = self.estimator.last_good()
+        self.line_map.retire(self._mapped)
+        self._mapped = np.empty(0, np.int64)
+        self._bootstrap.clear()
+        self._stillness.clear()
+        self.front_end.reset()
+
+    def _camera_rotation(self, samples: Samples | None) -> F64 | None:
+        """R_CnCp by the gyro: turns rays of the previous camera into the newest."""
+        if samples is None:
+            return None
+        t, gyro, _ = samples
+        steps = np.diff(t)[:, None] * (0.5 * (gyro[1:] + gyro[:-1]) - self.estimator.gyro_bias())
+        R_BpBn = np.eye(3)
+        for R in so3_exp(steps):
+            R_BpBn = R_BpBn @ R
+        R_BC = self.calibration.T_BC[:3, :3]
+        return R_BC.T @ R_BpBn.T @ R_BC
+
+    def _map(self) -> None:
+        """Hand the window's lines to the map, new ones with all their views; retire those that left it."""
+        lines, newest = self.estimator.lines(), self.estimator.window.n - 1
+        self.line_map.refine(lines.ids, lines.pluecker, lines.cov, lines.views)
+        new = ~np.isin(lines.ids, self._mapped)
+        for slot, T_WC in enumerate(lines.T_WC):
+            given = lines.seen[:, slot] & (new | (slot == newest))
+            self.line_map.observe(lines.ids[given], lines.ends[given, slot], T_WC)
+        self.line_map.retire(np.setdiff1d(self._mapped, lines.ids))
+        self._mapped = lines.ids
+
+    def _drop(self, line_ids: I64) -> None:
+        """Lines that turned out wrong never reach the map."""
+        wrong = np.intersect1d(line_ids, self._mapped)
+        self.line_map.drop(wrong)
+        self._mapped = np.setdiff1d(self._mapped, wrong)
+
+    def _estimate(self, samples: Samples) -> Estimate:
+        w = self.estimator.window
+        k, gyro = w.n - 1, samples[1]
+        T_WB = np.eye(4)
+        T_WB[:3, :3], T_WB[:3, 3] = w.R[k], w.p[k]
+        gyro_bias, accel_bias = w.b[k, :3].copy(), w.b[k, 3:].copy()
+        return Estimate(int(w.t_ns[k]), T_WB, w.v[k].copy(), gyro[-1] - gyro_bias, gyro_bias, accel_bias,
+                        self.estimator.covariance(), self.estimator.newest_is_keyframe, self.timings)
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        started = time.perf_counter()
+        yield
+        self.timings[stage] = time.perf_counter() - started

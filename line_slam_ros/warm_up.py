@@ -1,0 +1,42 @@
+"""Runs every compiled kernel once, so that the first real frame does not wait for a compiler."""
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from line_slam_ros.config import Estimator as EstimatorOptions
+from line_slam_ros.estimation.bootstrap import Bootstrap
+from line_slam_ros.estimation.estimator import Estimator
+from line_slam_ros.frontend.front_end import FrontEnd
+from line_slam_ros.geometry.imu import between
+from line_slam_ros.simulation.features import Room, Sequence, Trajectory, calibration
+from line_slam_ros.types import Calibration, Frame
+
+
+def warm_up_estimator(options: EstimatorOptions) -> None:
+    """A few simulated seconds: start from motion, optimise, marginalise."""
+    sequence = Sequence(Trajectory.random(1), Room.random(1, points=300, lines=60), calibration(), 4.0, frame_rate=10.0)
+    estimator = Estimator(options, sequence.calibration, 450.0, 300, 60)
+    bootstrap, started, previous = Bootstrap(estimator, sequence.calibration), False, 0
+    for observations, imu in sequence:
+        samples = between(imu, previous, observations.t_ns) if observations.t_ns else None
+        previous = observations.t_ns
+        if not started:
+            started = bootstrap.add(observations, samples, None)
+        elif samples is not None:
+            estimator.step(observations, samples, False)
+            estimator.covariance()
+            estimator.lines()
+            estimator.marginalise()
+
+
+def warm_up_front_end(front_end: FrontEnd, calibration: Calibration) -> None:
+    """Three shifted views of a random mosaic of rectangles."""
+    rng = np.random.default_rng(0)
+    canvas = np.full((calibration.height + 16, calibration.width + 16), 128, np.uint8)
+    for _ in range(60):
+        x, y = rng.integers(0, canvas.shape[1]), rng.integers(0, canvas.shape[0])
+        cv2.rectangle(canvas, (int(x), int(y)), (int(x + 150), int(y + 90)), int(rng.integers(0, 255)), -1)
+    for k in range(3):
+        view = np.ascontiguousarray(canvas[k:k + calibration.height, k:k + calibration.width])
+        front_end.track(Frame(k + 1, view), None if k == 1 else np.eye(3))

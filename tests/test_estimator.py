@@ -1,0 +1,140 @@
+"""The estimator on simulated features with exact truth: starts, accuracy, marginalisation, rest, failure."""
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from line_slam_ros.config import Estimator as Options
+from line_slam_ros.estimation.bootstrap import Bootstrap
+from line_slam_ros.estimation.estimator import Estimator
+from line_slam_ros.estimation.initialisation import upright
+from line_slam_ros.estimation.marginalisation import eliminate
+from line_slam_ros.estimation.stillness import Stillness
+from line_slam_ros.geometry.imu import between
+from line_slam_ros.geometry.lie import so3_exp
+from line_slam_ros.simulation.features import GRAVITY_W, Room, Sequence, Trajectory, calibration
+from line_slam_ros.types import LineObservations, PointObservations
+
+NO_LINES = LineObservations(np.empty(0, np.int64), np.empty((0, 2, 2)), np.empty((0, 2)))
+NO_POINTS = PointObservations(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2)))
+
+
+def run(sequence, options=None, change=lambda k, seen: seen):
+    """Feeds a sequence; returns the estimator, times (s) and positions (N, 3), covariances of position, failures."""
+    estimator = Estimator(options or Options(), sequence.calibration, 450.0, 700, 150)
+    bootstrap, stillness = Bootstrap(estimator, sequence.calibration), Stillness(450.0, 0.3)
+    previous, started, out, failures = None, False, [], []
+    for k, (seen, imu) in enumerate(sequence):
+        seen = change(k, seen)
+        samples = None if previous is None else between(imu, previous, seen.t_ns)
+        previous = seen.t_ns
+        still = stillness.add(seen, samples)
+        if not started:
+            started = bootstrap.add(seen, samples, stillness.mean_imu() if still else None)
+        else:
+            estimator.step(seen, samples, still)
+        if started:
+            w = estimator.window
+            out.append((seen.t_ns * 1e-9, *w.p[w.n - 1], *np.diag(estimator.covariance())[3:6]))
+            failures.append(estimator.failure)
+            estimator.marginalise()
+    out = np.array(out)
+    return estimator, out[:, 0], out[:, 1:4], out[:, 4:7], failures
+
+
+def aligned_error(sequence, t, p):
+    """RMS position error (m) after the best rigid alignment in heading and position."""
+    truth = sequence.trajectory.at(t)[1]
+    a, b = p - p.mean(axis=0), truth - truth.mean(axis=0)
+    heading = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a[:, :2] * b[:, :2]).sum())
+    return float(np.sqrt(np.mean(np.sum((a @ so3_exp(np.array([0, 0, heading])).T - b) ** 2, axis=1))))
+
+
+@pytest.fixture(scope='module')
+def moving():
+    return Sequence(Trajectory.random(2), Room.random(2), calibration(), 10.0)
+
+
+@pytest.mark.parametrize('representation', ['orthonormal', 'host'])
+def test_starts_in_motion_and_tracks_to_a_centimetre_per_metre(moving, representation):
+    _, t, p, _, failures = run(moving, Options(line_representation=representation))
+    assert t[0] <= 3.0
+    assert not any(failures)
+    assert aligned_error(moving, t, p) < 0.03
+
+
+def test_points_alone_and_lines_with_few_points_both_work(moving):
+    _, t, p, *_ = run(moving, change=lambda k, s: replace(s, lines=NO_LINES))
+    assert aligned_error(moving, t, p) < 0.03
+
+    def few(k, s):
+        kept = (s.points.ids % 12 == 0) | (k <= 60)
+        return replace(s, points=PointObservations(s.points.ids[kept], s.points.uv[kept], s.points.x[kept]))
+
+    _, t, p, *_ = run(moving, change=few)
+    assert aligned_error(moving, t, p) < 0.05
+
+
+def test_biases_are_found(moving):
+    estimator, *_ = run(moving)
+    b = estimator.window.b[estimator.window.n - 1]
+    np.testing.assert_allclose(b[:3], moving.gyro_bias, atol=2e-3)
+    np.testing.assert_allclose(b[3:], moving.accel_bias, atol=5e-2)
+
+
+def test_at_rest_it_starts_within_a_second_and_does_not_drift():
+    sequence = Sequence(Trajectory.random(3, rest=30.0), Room.random(3), calibration(), 12.0)
+    _, t, p, *_ = run(sequence)
+    assert t[0] <= 1.0
+    assert np.linalg.norm(p - p[0], axis=1).max() < 0.005
+
+
+def test_rest_then_motion_keeps_metric_scale():
+    sequence = Sequence(Trajectory.random(4, rest=2.0), Room.random(4), calibration(), 12.0)
+    _, t, p, *_ = run(sequence)
+    assert t[0] <= 1.0
+    assert aligned_error(sequence, t, p) < 0.04
+
+
+def test_blindness_longer_than_allowed_is_a_failure_that_says_so(moving):
+    def blind(k, seen):
+        return replace(seen, points=NO_POINTS, lines=NO_LINES) if k >= 120 else seen
+
+    *_, failures = run(moving, Options(max_blind_s=1.0), blind)
+    assert not any(failures[:70])
+    assert 'no features' in failures[-1]
+
+
+def test_covariance_grows_with_distance_and_bounds_the_error(moving):
+    _, t, p, cov, _ = run(moving)
+    sigma = np.sqrt(cov.sum(axis=1))
+    assert sigma[-1] > sigma[0] > 0.0
+    assert aligned_error(moving, t, p) < 4.0 * sigma[-1]
+
+
+def test_upright_takes_the_measured_up_direction_to_z():
+    for up in np.random.default_rng(0).normal(size=(20, 3)).tolist() + [[0, 0, 9.8], [0, 0, -9.8]]:
+        np.testing.assert_allclose(upright(np.array(up)) @ up, [0, 0, np.linalg.norm(up)], atol=1e-12)
+
+
+def test_eliminating_a_state_leaves_the_solution_of_the_others():
+    rng = np.random.default_rng(1)
+    A = rng.normal(size=(30, 12))
+    H, g = A.T @ A, rng.normal(size=12)
+    gone, kept = np.arange(4, 7), np.r_[0:4, 7:12]
+    H_r, g_r = eliminate(H, g, gone, kept)
+    np.testing.assert_allclose(np.linalg.solve(H_r, g_r), np.linalg.solve(H, g)[kept], rtol=1e-8)
+
+
+def test_eliminating_an_unobserved_direction_adds_no_information():
+    H = np.diag([1.0, 0.0, 2.0, 3.0])
+    H_r, _ = eliminate(H, np.zeros(4), np.array([0, 1]), np.array([2, 3]))
+    np.testing.assert_allclose(H_r, np.diag([2.0, 3.0]), atol=1e-12)
+
+
+def test_simulated_inertial_data_is_the_derivative_of_the_trajectory():
+    trajectory, t, h = Trajectory.random(5, rest=1.0), np.linspace(0.5, 6.0, 50), 1e-4
+    R, _, v, _, force = trajectory.at(t)
+    (_, p1, v1, *_), (_, p0, v0, *_) = trajectory.at(t + h), trajectory.at(t - h)
+    np.testing.assert_allclose((p1 - p0) / (2 * h), v, atol=1e-6)
+    np.testing.assert_allclose(np.einsum('nji,nj->ni', R, (v1 - v0) / (2 * h) - GRAVITY_W), force, atol=1e-5)

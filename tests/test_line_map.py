@@ -1,0 +1,314 @@
+"""The line map: trimming from many views, quality, merging, bounded memory."""
+import numpy as np
+import pytest
+
+from line_slam_ros.config import Mapping
+from line_slam_ros.geometry.lie import rigid_inverse
+from line_slam_ros.geometry.lines import transform_lines, trim
+from line_slam_ros.mapping.fusion import Landmark, across_covariance, fuse, offset, worst_sigma
+from line_slam_ros.mapping.line_map import VIEWS, LineMap
+from line_slam_ros.mapping.table import IdTable
+from line_slam_ros.mapping.trimming import _foot
+
+FOCAL = 460.0  # px
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(11)
+
+
+def looking(eye, target):
+    """T_WC of a camera at eye that looks at target."""
+    z = (target - eye) / np.linalg.norm(target - eye)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    T_WC = np.eye(4)
+    T_WC[:3, :3], T_WC[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), eye
+    return T_WC
+
+
+def pluecker_through(a, b):
+    d = (b - a) / np.linalg.norm(b - a)
+    return np.concatenate([np.cross(a, d), d])
+
+
+def covariance(a, b, sigma):
+    """Covariance of [n, d] of a line whose two points are each known with sigma (m) in every direction."""
+    a, b = np.asarray(a, float), np.asarray(b, float)
+    h, points = 1e-6, np.concatenate([a, b])
+    J = np.stack([(pluecker_through(*(points + e).reshape(2, 3)) - pluecker_through(*(points - e).reshape(2, 3)))
+                  / (2 * h) for e in h * np.eye(6)], axis=1)
+    return sigma**2 * J @ J.T
+
+
+def see(line_map, rng, line_id, a, b, views, px=0.0, part=lambda k: (0.0, 1.0), distance=4.0):
+    """Feed observations of the parts of a segment from random places in front of it; ends in random order."""
+    centre = (a + b) / 2
+    for k in range(views):
+        T_WC = looking(centre + rng.uniform([-1.5, -distance - 1, -1], [1.5, -distance, 1]), centre)
+        p_C = (np.stack([a + s * (b - a) for s in part(k)]) - T_WC[:3, 3]) @ T_WC[:3, :3]
+        ends = p_C[:, :2] / p_C[:, 2:] + rng.normal(size=(2, 2)) * px / FOCAL
+        line_map.observe(np.array([line_id]), ends[None, :: rng.choice([-1, 1])], T_WC)
+
+
+def add(line_map, rng, line_id, a, b, sigma=0.002, views=12, **how):
+    a, b = np.asarray(a, float), np.asarray(b, float)
+    line_map.refine(np.array([line_id]), pluecker_through(a, b)[None], covariance(a, b, sigma)[None],
+                    np.array([views]))
+    see(line_map, rng, line_id, a, b, views, **how)
+
+
+def end_error(segments, a, b):
+    """Mean error along the line of a single mapped segment, whichever way it runs."""
+    assert len(segments) == 1
+    ends = segments.ends[0]
+    if (ends[1] - ends[0]) @ (np.asarray(b) - a) < 0:
+        ends = ends[::-1]
+    return np.linalg.norm(ends - [a, b], axis=1).mean()
+
+
+def clipped(rng):
+    """One view in six reaches the first end, one in six the second, the rest neither."""
+    def part(k):
+        s, t = np.sort(rng.uniform(0.05, 0.95, 2))
+        return [(0.0, t), (s, 1.0), (s, t), (s, t), (s, t), (s, t)][k % 6]
+    return part
+
+
+A, B = np.array([-1.0, 4.0, 0.2]), np.array([1.0, 4.5, 0.6])
+
+
+@pytest.mark.parametrize('px, tolerance', [(0.0, 1e-9), (1.0, 0.006), (4.5, 0.03)])
+def test_full_views_give_the_ends_however_they_are_ordered(rng, px, tolerance):
+    line_map = LineMap(Mapping())
+    add(line_map, rng, 3, A, B, views=30, px=px)
+    assert end_error(line_map.segments(), A, B) <= tolerance
+
+
+@pytest.mark.parametrize('px, tolerance', [(0.0, 0.01), (1.0, 0.02), (4.5, 0.06)])
+def test_clipped_views_give_the_ends_that_few_of_them_reach(rng, px, tolerance):
+    line_map = LineMap(Mapping())
+    add(line_map, rng, 3, A, B, views=48, px=px, part=clipped(rng))
+    assert end_error(line_map.segments(), A, B) <= tolerance
+
+
+def test_the_compiled_foot_is_that_of_the_geometry_module(rng):
+    L_W = pluecker_through(A, B)
+    for _ in range(20):
+        T_WC = looking(rng.uniform([-2, -1, -1], [2, 1, 1]), (A + B) / 2)
+        ends, out = rng.uniform(-0.4, 0.4, (2, 2)), np.empty(3)
+        p_C = trim(transform_lines(rigid_inverse(T_WC), L_W[None])[0], ends)
+        for k in range(2):
+            assert _foot(L_W[:3], L_W[3:], T_WC[:3], ends[k], 100.0, out)
+            assert out[0] == pytest.approx((T_WC[:3, :3] @ p_C[k] + T_WC[:3, 3]) @ L_W[3:], abs=1e-9)
+
+
+def test_one_bad_frame_moves_nothing(rng):
+    line_map = LineMap(Mapping())
+    add(line_map, rng, 3, A, B, views=10, part=lambda k: (-0.8, 1.9) if k == 4 else (0.0, 1.0))
+    assert end_error(line_map.segments(), A, B) < 1e-9
+
+
+def test_feet_behind_the_camera_and_along_the_line_are_not_used(rng):
+    line_map = LineMap(Mapping())
+    add(line_map, rng, 3, A, B, views=8)
+    away = looking(np.array([0.0, 0.0, 0.0]), np.array([0.0, -4.0, 0.0]))
+    direction = (B - A) / np.linalg.norm(B - A)
+    end_on = looking(A - 3 * direction + [0.0, 0.0, 0.05], B)
+    for T_WC in [away] * 10 + [end_on] * 10:
+        line_map.observe(np.array([3]), np.array([[[-0.3, 0.01], [0.3, 0.02]]]), T_WC)
+    assert end_error(line_map.segments(), A, B) < 1e-9
+
+
+def test_a_line_of_twelve_metres_is_kept_whole(rng):
+    a, b = np.array([-6.0, 7.0, 0.0]), np.array([6.0, 7.0, 0.0])
+    line_map = LineMap(Mapping())
+    add(line_map, rng, 0, a, b, views=20, px=0.5, distance=7.0)
+    line_map.retire(np.array([0]))
+    assert end_error(line_map.segments(), a, b) < 0.05
+
+
+def test_ends_follow_a_refined_estimate(rng):
+    line_map = LineMap(Mapping())
+    further = 1.3
+    add(line_map, rng, 0, A, B, views=12)
+    views = line_map._active['poses'][0, :12].copy()
+    line_map.refine(np.array([0]), -pluecker_through(further * A, further * B)[None],
+                    covariance(further * A, further * B, 0.001)[None], np.array([12]))
+    ends = line_map.segments().ends[0]
+    centre = views[:, :, 3].mean(axis=0)
+    expected = centre + (np.stack([A, B]) - centre) * np.linalg.norm(further * A - centre) / np.linalg.norm(A - centre)
+    assert np.linalg.norm(np.diff(ends, axis=0)) > 1.15 * np.linalg.norm(B - A)  # the same rays, further out
+    np.testing.assert_allclose(ends, expected, atol=0.25)
+    assert (ends[1] - ends[0]) @ (B - A) > 0  # a direction turned round by the estimator does not swap the ends
+
+
+@pytest.mark.parametrize('change', [dict(sigma=0.2), dict(views=3), dict(part=lambda k: (0.5, 0.51))])
+def test_doubtful_lines_are_neither_shown_nor_kept(rng, change):
+    line_map = LineMap(Mapping())
+    add(line_map, rng, 0, A, B, **change)
+    assert len(line_map.active()) == len(line_map.segments()) == 0
+    line_map.retire(np.array([0]))
+    assert len(line_map.segments()) == 0
+
+
+def test_a_line_without_parallax_is_not_shown(rng):
+    line_map = LineMap(Mapping())
+    line_map.refine(np.array([0]), pluecker_through(A, B)[None], covariance(A, B, 1e-3)[None], np.array([9]))
+    T_WC = looking(np.zeros(3), (A + B) / 2)
+    p_C = (np.stack([A, B]) - T_WC[:3, 3]) @ T_WC[:3, :3]
+    for _ in range(9):
+        line_map.observe(np.array([0]), (p_C[:, :2] / p_C[:, 2:])[None], T_WC)
+    assert len(line_map.segments()) == 0
+
+
+def test_retired_lines_stay_and_their_views_are_forgotten(rng):
+    line_map = LineMap(Mapping())
+    for k in range(300):
+        offset_k = np.array([0.0, 0.0, 0.2 * k])
+        add(line_map, rng, k, A + offset_k, B + offset_k, views=4)
+        line_map.retire(np.array([k, 10_000]))
+    assert len(line_map.segments()) == 300 and len(line_map.active()) == 0
+    assert len(line_map._active._ids) == 64  # rows of the active table, allocated once
+
+
+def test_views_of_a_long_track_are_bounded_and_spread_over_its_life(rng):
+    line_map = LineMap(Mapping())
+    add(line_map, rng, 0, A, B, views=5)
+    for k in range(1000):
+        T_WC = np.eye(4)
+        T_WC[0, 3] = k
+        line_map.observe(np.array([0]), np.zeros((1, 2, 2)), T_WC)
+    count = line_map._active['count'][0]
+    x = line_map._active['poses'][0, :count, 0, 3]
+    assert VIEWS // 2 <= count <= VIEWS
+    assert np.ptp(np.diff(x)[1:]) == 0 and x[-1] >= 1000 - 2 * (x[-1] - x[-2])
+
+
+def test_duplicates_become_one_better_line(rng):
+    line_map = LineMap(Mapping())
+    shift = np.array([0.0, 0.01, 0.01])
+    add(line_map, rng, 8, A + shift, A + 0.7 * (B - A) + shift, sigma=0.01)
+    add(line_map, rng, 5, A + 0.6 * (B - A), B, sigma=0.003)
+    before = {i: s for i, s in zip(line_map.active().ids, line_map.active().sigma, strict=True)}
+    line_map.retire(np.array([8]))
+    line_map.retire(np.array([5]))
+    merged = line_map.segments()
+    assert list(merged.ids) == [5] and merged.views[0] == 24
+    assert merged.sigma[0] < before[8]
+    assert end_error(merged, A, B) < 0.02
+
+
+def test_a_crooked_piece_beside_a_line_is_merged_without_bending_it(rng):
+    line_map, middle, along = LineMap(Mapping()), (A + B) / 2, (B - A) / np.linalg.norm(B - A)
+    add(line_map, rng, 1, A, B, sigma=0.002, views=30)
+    crooked = 0.1 * (along + [0, 0, np.tan(np.radians(4))])  # 4 degrees off in 20 cm, surer of it than it should be
+    add(line_map, rng, 2, middle - crooked, middle + crooked, sigma=0.001)
+    line_map.retire(np.array([1, 2]))
+    assert list(line_map.segments().ids) == [1] and end_error(line_map.segments(), A, B) < 0.02
+
+
+@pytest.mark.parametrize('name, a, b', [
+    ('parallel, 10 cm apart', A + [0, 0, 0.1], B + [0, 0, 0.1]),
+    ('collinear, 50 cm apart', B + 0.5 * (B - A) / np.linalg.norm(B - A), B + (B - A)),
+    ('crossing', (A + B) / 2 + [0, 0, -1], (A + B) / 2 + [0, 0, 1])])
+@pytest.mark.parametrize('sigma', [0.001, 0.04])
+def test_distinct_lines_are_not_merged(rng, name, a, b, sigma):
+    line_map = LineMap(Mapping(max_sigma_m=0.2))
+    add(line_map, rng, 1, A, B, sigma=sigma)
+    add(line_map, rng, 2, a, b, sigma=sigma)
+    line_map.retire(np.array([1, 2]))
+    assert list(line_map.segments().ids) == [1, 2], name
+
+
+def test_certain_lines_that_meet_at_four_degrees_are_not_merged(rng):
+    line_map, length = LineMap(Mapping()), np.linalg.norm(B - A)
+    add(line_map, rng, 1, A, B, sigma=0.001)
+    add(line_map, rng, 2, B, B + (B - A) + [0, 0, length * np.tan(np.radians(4))], sigma=0.001)
+    line_map.retire(np.array([1, 2]))
+    assert list(line_map.segments().ids) == [1, 2]
+
+
+def test_an_active_duplicate_of_a_kept_line_is_shown_merged(rng):
+    line_map = LineMap(Mapping())
+    add(line_map, rng, 1, A, B)
+    line_map.retire(np.array([1]))
+    add(line_map, rng, 2, A, B)
+    assert list(line_map.segments().ids) == [1] and list(line_map.active().ids) == [2]
+
+
+def test_an_id_that_comes_back_is_listed_once(rng):
+    line_map = LineMap(Mapping())
+    add(line_map, rng, 1, A, B)
+    line_map.retire(np.array([1]))
+    add(line_map, rng, 1, A + [0, 0, 1], B + [0, 0, 1], sigma=0.01)
+    assert list(line_map.segments().ids) == [1]
+    assert end_error(line_map.segments(), A, B) < 1e-9  # another line, and less certain
+
+
+def test_the_same_calls_give_the_same_map():
+    def build():
+        rng, line_map = np.random.default_rng(2), LineMap(Mapping())
+        for k in range(60):
+            a = rng.uniform([-2, 3, -1], [2, 5, 1])
+            add(line_map, rng, k, a, a + rng.normal(size=3) + [1, 0, 0], px=1.0, views=6)
+            if k % 3 == 2:
+                line_map.retire(np.array([k - 2, k - 1]))
+        return line_map.segments()
+    first, second = build(), build()
+    assert len(first) > 30 and np.all(np.diff(first.ids) > 0)
+    for name in ('ids', 'pluecker', 'ends', 'views', 'sigma'):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+
+
+def test_version_changes_with_the_map_and_clear_empties_it(rng):
+    line_map = LineMap(Mapping())
+    seen = {line_map.version}
+    add(line_map, rng, 1, A, B)
+    seen.add(line_map.version)
+    line_map.retire(np.array([1]))
+    seen.add(line_map.version)
+    assert len(line_map.segments()) == 1
+    line_map.clear()
+    seen.add(line_map.version)
+    assert len(seen) == 4 and len(line_map.segments()) == 0
+
+
+def test_across_covariance_agrees_with_samples(rng):
+    pluecker, cov, point = pluecker_through(A, B), covariance(A, B, 0.01), A + 1.5 * (B - A)
+    samples = np.stack([pluecker_through(*(np.stack([A, B]) + 0.01 * rng.normal(size=(2, 3)))) for _ in range(20000)])
+    moved = offset(samples, point)
+    np.testing.assert_allclose(np.cov(moved.T), across_covariance(pluecker, cov, point), atol=0.05 * 2.5e-4)
+    largest = np.sqrt(np.linalg.eigvalsh(across_covariance(pluecker, cov, point))[-1])
+    assert worst_sigma(pluecker[None], cov[None], np.stack([A, point])[None])[0] == pytest.approx(largest)
+
+
+def test_fusion_is_the_maximum_likelihood_line(rng):
+    """Against many noisy estimates: the error of the fusion is what its covariance says, in all four parameters."""
+    a2, b2 = A + 0.4 * (B - A), A + 1.8 * (B - A)
+    normalised = []
+    for _ in range(400):
+        noisy = np.stack([A, B]) + 0.01 * rng.normal(size=(2, 3)), np.stack([a2, b2]) + 0.004 * rng.normal(size=(2, 3))
+        fused = fuse(Landmark(0, pluecker_through(*noisy[0]), covariance(*noisy[0], 0.01), noisy[0], 1, 0.01),
+                     Landmark(1, pluecker_through(*noisy[1]), covariance(*noisy[1], 0.004), noisy[1], 1, 0.004))
+        assert abs(fused.pluecker[:3] @ fused.pluecker[3:]) < 1e-12
+        for point in (A, b2):
+            error = offset(fused.pluecker, point)
+            across = across_covariance(fused.pluecker, fused.cov, point)
+            normalised.append(error @ np.linalg.pinv(across, rcond=1e-6) @ error)
+    assert np.mean(normalised) == pytest.approx(2.0, abs=0.25)
+
+
+def test_table_keeps_records_when_it_grows_and_shrinks():
+    table = IdTable(value=((2,), np.float64))
+    for k in range(200):
+        row = table.put(k)
+        table['value'][row] = k
+    for k in range(0, 200, 2):
+        table.remove(k)
+    assert sorted(table.ids) == list(range(1, 200, 2)) and 4 not in table and 5 in table
+    rows = table.rows([1, 99, 4])
+    assert rows[2] == -1 and table['value'][rows[:2], 0].tolist() == [1, 99]
+    with pytest.raises(KeyError):
+        table.remove(4)

@@ -1,0 +1,80 @@
+"""The optimiser's normal equations against the cost itself: the slope they predict is the slope there is."""
+import numpy as np
+import pytest
+
+from line_slam_ros.estimation.landmarks import back_substitute, retract_landmarks
+from line_slam_ros.estimation.solver import Solver, SolverOptions, retract_states
+from line_slam_ros.estimation.window import STATE, Window
+from line_slam_ros.geometry.lie import so3_exp
+from line_slam_ros.geometry.lines import line_from_points
+from line_slam_ros.geometry.orthonormal import orthonormal_from_pluecker
+from line_slam_ros.types import ImuNoise
+
+STATES, POINTS, LINES, SIGMA, NOISE = 4, 20, 10, 0.02, 0.05
+R_BC, p_BC = so3_exp([0.1, 0.2, 0.3]), np.array([0.1, 0.0, 0.05])
+
+
+@pytest.fixture(params=[False, True], ids=['orthonormal', 'host'])
+def solver(request):
+    """A window in which nothing agrees: random states, links, prior, points and lines, outliers among them."""
+    rng, window = np.random.default_rng(0), Window(STATES + 2, ImuNoise(), POINTS, LINES)
+    for k in range(STATES):
+        t = np.linspace(0.0, 0.2, 41)
+        samples = t, 0.1 * rng.normal(size=(41, 3)), 0.1 * rng.normal(size=(41, 3)) + [0, 0, 9.81]
+        window.append(k * 200_000_000, so3_exp(0.1 * rng.normal(size=3)), [0.2 * k, 0, 0] + 0.05 * rng.normal(size=3),
+                      0.1 * rng.normal(size=3), 0.01 * rng.normal(size=6), samples if k else None)
+    window.still[1:3] = True
+    dim = STATE * STATES
+    A = rng.normal(size=(dim, dim))
+    window.prior_H[:dim, :dim], window.prior_g[:dim] = A @ A.T, rng.normal(size=dim)
+    _fill_points(window, rng)
+    _fill_lines(window, rng)
+    return Solver(window, SolverOptions(R_BC, p_BC, np.array([0.0, 0.0, -9.81]), 4.0, 4.0, request.param))
+
+
+def _fill_points(window, rng):
+    table, n = window.points, STATES
+    table.count, table.solved[:] = POINTS, True
+    table.R_WA[:], table.p_WA[:] = window.R[0] @ R_BC, window.p[0] + window.R[0] @ p_BC
+    table.abr[:] = np.column_stack([0.3 * rng.normal(size=(POINTS, 2)), rng.uniform(0.1, 0.4, POINTS)])
+    table.seen[:, :n] = rng.random((POINTS, n)) < 0.8
+    table.z[:, :n] = table.abr[:, None, :2] + NOISE * rng.normal(size=(POINTS, n, 2))
+    table.sigma[:] = SIGMA
+
+
+def _fill_lines(window, rng):
+    table, n = window.lines, STATES
+    table.count, table.solved[:] = LINES, True
+    p_C = rng.normal(size=(LINES, 2, 3)) * [1, 1, 0.3] + [0, 0, 5]
+    p_W = p_C @ (window.R[0] @ R_BC).T + window.R[0] @ p_BC + window.p[0]
+    table.origin[:] = window.p[0]
+    table.U[:], table.phi[:] = orthonormal_from_pluecker(line_from_points(*np.moveaxis(p_W - window.p[0], 1, 0)))
+    table.rho[:] = rng.uniform(0.1, 0.4, LINES)
+    table.seen[:, :n] = rng.random((LINES, n)) < 0.8
+    table.z[:, :n] = (p_C[..., :2] / p_C[..., 2:])[:, None] + NOISE * rng.normal(size=(LINES, n, 2, 2))
+    table.sigma[:] = SIGMA
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_eliminated_normal_equations_predict_the_slope_of_the_cost(solver, seed):
+    """Along any step of the states, the landmarks following: g dx - sum a' A^-1 a, exactly, robust weights and all."""
+    w, use_points, use_lines = solver.window, np.ones(POINTS, bool), np.ones(LINES, bool)
+    solver.linearise(use_points, use_lines)
+    scale = np.tile(np.repeat([0.1, 0.01], [9, 6]), STATES)
+    dx = scale * np.random.default_rng(seed).normal(size=STATE * STATES)
+    predicted = solver.g[:len(dx)] @ dx
+    for use, seen, size, E, A, a, step in (
+            (use_points, w.points.seen, 3, solver._E_p, solver._A_p, solver._a_p, solver._step_p),
+            (use_lines, w.lines.seen, 4, solver._E_l, solver._A_l, solver._a_l, solver._step_l)):
+        back_substitute(w.n, use, seen, size, E, A, a, dx, step)
+        predicted -= np.einsum('ij,ijk,ik->', a, A, a)
+    before = solver._save()
+
+    def cost(part):
+        solver._restore(before)
+        retract_states(w.n, w.R, w.p, w.v, w.b, part * dx)
+        retract_landmarks(use_points, w.points.abr, part * solver._step_p, use_lines,
+                          solver.options.host_lines, w.lines.U, w.lines.phi, w.lines.rho, part * solver._step_l)
+        return solver.cost()
+
+    assert (cost(1e-5) - cost(-1e-5)) / 2e-5 == pytest.approx(predicted, rel=1e-6)
