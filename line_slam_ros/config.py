@@ -61,7 +61,7 @@ class Lines(Checked):
 class Estimator(Checked):
     """Sliding window optimisation."""
 
-    window: int = param(11, 'states in the sliding window, keyframes and newest frame', 4, 40)
+    window: int = param(13, 'states in the sliding window, keyframes and newest frame', 4, 40)
     max_iterations: int = param(4, 'optimiser iterations per frame', 1, 50)
     point_sigma_px: float = param(0.3, 'standard deviation of a tracked corner, px', 0.05, 20.0)
     line_representation: str = param('orthonormal', 'line parameters: orthonormal (4) or host (2)',
@@ -77,7 +77,7 @@ class Estimator(Checked):
     init_max_scale_sigma: float = param(0.05, 'relative uncertainty of scale at which a start is accepted', 0.001, 1.0)
     keyframe_max_s: float = param(1.0, 'longest time between keyframes while moving, s', 0.1, 10.0)
     max_blind_s: float = param(2.0, 'longest time without features before the estimate counts as lost, s', 0.1, 60.0)
-    keyframe_parallax_px: float = param(10.0, 'mean parallax to the last keyframe that makes a new one, px', 0.5, 200.0)
+    keyframe_parallax_px: float = param(20.0, 'mean parallax to the last keyframe that makes a new one, px', 0.5, 200.0)
 
 
 @dataclass(frozen=True)

@@ -118,9 +118,10 @@ def test_saving_where_nobody_can_write_is_refused_with_a_reason(node: Process, p
     assert not reply.success and '/proc/nowhere/map' in reply.message
 
 
+@pytest.mark.parametrize('when', ['loading compiled code', 'ready for data'])
 @pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM])
-def test_signals_end_the_node_with_success(how: int, peer: Peer, tmp_path: Path) -> None:
-    with slam_node(tmp_path / 'log', *POSES_GIVEN, '-r', '__node:=ending') as process:
-        assert peer.spin_until(lambda: 'ready for data' in process.text, START_S)
+def test_signals_end_the_node_with_success(how: int, when: str, peer: Peer, tmp_path: Path) -> None:
+    with slam_node(tmp_path / 'log', *OFFICE_ARGS, '-r', '__node:=ending') as process:
+        assert peer.spin_until(lambda: when in process.text, START_S)
         assert process.stop(how) == 0, process.text
     assert 'Traceback' not in process.text

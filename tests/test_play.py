@@ -145,6 +145,7 @@ def test_files_are_left_behind(live: Live) -> None:
     assert names == {'trajectory.tum', 'lines.csv', 'lines.ply', 'output.mcap', 'figure.png'}
     assert len(read_csv(live.directory / 'lines.csv')) > 0
     assert 'poses' in live.play and 'lines written to' in live.play
+    assert 'Traceback' not in live.play + live.node
 
 
 def test_recording_holds_every_output(live: Live) -> None:

@@ -24,7 +24,7 @@ from line_slam_ros.factors.imu_factor import imu_jacobians, imu_residual
 from line_slam_ros.geometry.lie_kernels import retract_rotation
 from line_slam_ros.types import F64
 
-CONVERGED = 1e-3  # relative decrease of the cost below which iterating ends
+CONVERGED = 1.0  # decrease of the cost (half squared standard deviations) below which iterating ends
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -192,7 +192,7 @@ class Solver:
             new_cost = self.cost()
             if new_cost < cost:
                 self._damping = max(0.1 * self._damping, 1e-9)
-                done, cost = cost - new_cost < CONVERGED * cost, new_cost
+                done, cost = cost - new_cost < CONVERGED, new_cost
                 if done:
                     return cost
             else:

@@ -12,6 +12,7 @@ from rclpy.node import Node
 
 from line_slam_ros.nodes.health import Latency, Recent
 from line_slam_ros.nodes.inputs import Inputs
+from line_slam_ros.nodes.publishers import NO_EVENTS
 from line_slam_ros.shell_config import ShellConfig
 from line_slam_ros.types import Estimate, Status
 from msg_adapters import outputs
@@ -41,7 +42,7 @@ class Diagnostics:
         self._node, self._inputs, self._shell = node, inputs, shell
         self._new = ros_messages()
         kind = self._new.type('diagnostic_msgs/msg/DiagnosticArray')
-        self._publisher = node.create_publisher(kind, '/diagnostics', 10)
+        self._publisher = node.create_publisher(kind, '/diagnostics', 10, event_callbacks=NO_EVENTS)
         self.waiting_for = ''
         self._status, self._resets, self._poses = Status.INITIALISING, 0, 0
         self._latency = Latency()

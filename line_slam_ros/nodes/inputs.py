@@ -8,6 +8,7 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
@@ -15,11 +16,13 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 from line_slam_ros.calibration import checked_rigid, read_imu_noise, read_kalibr
 from line_slam_ros.inbox import Inbox, PoseInbox
 from line_slam_ros.nodes.health import Stream
+from line_slam_ros.nodes.polling import Polled, Poller
 from line_slam_ros.shell_config import ShellConfig
 from line_slam_ros.types import F64, Calibration, Frame, ImuNoise
 from msg_adapters import sensors
 
 DEPTHS = {'image': 10, 'imu': 2000}  # messages DDS keeps while the executor is busy; others 100
+NO_EVENTS = SubscriptionEventCallbacks(use_default_callbacks=False)  # they cost as much as messages; see publishers.py
 
 
 class Inputs:
@@ -36,6 +39,7 @@ class Inputs:
         self.pixels = 0  # of an image, as far as known
         self._waits_for_calibration = True
         self._early: deque[Frame] = deque(maxlen=shell.max_frames)
+        self._poller: Poller | None = None
         self._rig: tuple[F64, ImuNoise] | None = None  # T_BC and noise, for camera_info
         from_file = self._read_files()
         offset = from_file.time_offset if from_file else shell.time_offset
@@ -59,6 +63,12 @@ class Inputs:
         else:
             self._listen('imu', 'imu', Imu, 'IMU data', self._on_imu)
 
+    def close(self) -> None:
+        """No more messages; frames that are ready can still be taken."""
+        if self._poller is not None:
+            self._poller.stop()
+        self.inbox.close()
+
     def silent(self, now: float) -> list[str]:
         """What is missing and what to do about it, one sentence for each topic; now is time.monotonic()."""
         quiet = {name: s for name, s in self.streams.items() if now - s.last > self._shell.node.input_timeout}
@@ -78,7 +88,11 @@ class Inputs:
             except ValueError as error:
                 self.inbox.reject(f'{name} not usable', str(error), sensors.stamp_ns(msg))
 
-        self._node.create_subscription(kind, topic, arrived, qos)
+        group = Polled() if name == 'imu' else None
+        subscription = self._node.create_subscription(kind, topic, arrived, qos, callback_group=group,
+                                                      event_callbacks=NO_EVENTS)
+        if name == 'imu':
+            self._poller = Poller(subscription)
         self.streams[name] = stream
 
     def _on_image(self, msg: Image) -> None:

@@ -70,7 +70,7 @@ class LineSlamNode(Node):
         """Lets the worker finish its frame and joins it."""
         self._stopping = True
         self._calibrations.put(None)
-        self._incoming.inbox.close()
+        self._incoming.close()
         if self._worker.is_alive():
             self._worker.join(timeout=5.0)  # compiling cannot be interrupted; the thread is a daemon
 
@@ -151,12 +151,19 @@ class LineSlamNode(Node):
         for note in self._incoming.inbox.notes():
             self.get_logger().warning(note)
             self._diagnostics.remember(note)
-        if self._slam is not None and self._in_use.acquire(blocking=False):
-            try:
-                self._publish_map(self._slam)  # what changed since the last frames, should no more come
-            finally:
-                self._in_use.release()
+        self._publish_rest()
         self._diagnostics.publish()
+
+    def _publish_rest(self) -> None:
+        """What the last frames changed in the map, should no more come."""
+        slam = self._slam
+        if slam is None or not self._newest_ns or not self._in_use.acquire(blocking=False):
+            return
+        try:
+            if slam.line_map.version != self._map_version:
+                self._publish_map(slam)
+        finally:
+            self._in_use.release()
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         with self._in_use:
