@@ -55,6 +55,7 @@ class Estimator:
         self.newest_is_keyframe = True
         self.failure = ''
         self._last_sight_ns = 0
+        self._marginalised = False  # until then the prior is only the gauge, and nothing is bound to first estimates
 
     # -- start ---------------------------------------------------------------------------------------------------
 
@@ -76,7 +77,7 @@ class Estimator:
         information[:3, :3] = R.T @ information[:3, :3] @ R
         w.freeze(np.arange(1))
         w.prior_H[:STATE, :STATE] = information
-        self.newest_is_keyframe = True
+        self.newest_is_keyframe, self._marginalised = True, False
         self._triangulate()
 
     def refine(self, rounds: int) -> float:
@@ -142,6 +143,8 @@ class Estimator:
         if not self.newest_is_keyframe and (still or not w.still[newest - 1]):
             drop_state(self.solver, newest - 1)
         self._triangulate()
+        if not self._marginalised:
+            w.recentre_prior()
         self.solver.optimise(self.options.max_iterations)
         outliers = self._cull()
         self.newest_is_keyframe = self._is_keyframe()
@@ -153,6 +156,7 @@ class Estimator:
         w = self.window
         if w.n < w.slots - 1 or (w.n < w.slots and not self.newest_is_keyframe):
             return
+        self._marginalised = True
         p, q, newest = w.points, w.lines, w.n - 1
         q.views[:q.count] += q.seen[:q.count, 0]
         marginalise_oldest(self.solver, self._leaving(p, newest), self._leaving(q, newest))
