@@ -37,5 +37,5 @@ class ShellConfig(Checked):
                              choices=('imu', 'topic'))
     odom_frame: str = param('odom', 'name of the world frame in outgoing messages')
     body_frame: str = param('imu_link', 'name of the body (IMU) frame in outgoing messages')
-    max_frames: int = param(3, 'images waiting at most in the node; the oldest is dropped and counted', 1, 1000)
+    max_frames: int = param(6, 'images waiting at most in the node; the oldest is dropped and counted', 1, 1000)
     node: Node = field(default_factory=Node)

@@ -13,7 +13,7 @@ from line_slam_ros.estimation.estimator import Estimator
 from line_slam_ros.estimation.stillness import Stillness
 from line_slam_ros.frontend.front_end import FrontEnd
 from line_slam_ros.geometry.camera import Camera
-from line_slam_ros.geometry.imu import between
+from line_slam_ros.geometry.imu import between, longest_gap
 from line_slam_ros.geometry.lie import so3_exp
 from line_slam_ros.mapping.line_map import LineMap
 from line_slam_ros.types import (
@@ -29,6 +29,8 @@ from line_slam_ros.types import (
     Status,
 )
 from line_slam_ros.warm_up import warm_up_estimator, warm_up_front_end
+
+MAX_IMU_GAP_S = 0.2  # longer, and the motion in between is anyone's guess
 
 
 class Slam:
@@ -66,8 +68,10 @@ class Slam:
             samples = None if self._last_ns is None else between(imu, self._last_ns, frame.t_ns)
             with self._timed('track'):
                 observations = self.front_end.track(frame, self._camera_rotation(samples))
-            self._last_ns = frame.t_ns
+            previous_ns, self._last_ns = self._last_ns, frame.t_ns
             still = self._stillness.add(observations, samples)
+            if self.status is Status.TRACKING and (gap := longest_gap(imu, previous_ns, frame.t_ns)) > MAX_IMU_GAP_S:
+                return self._lose(f'no inertial data for {gap:.2f} s')
             if self.status is not Status.TRACKING or samples is None:
                 return self._initialise(observations, samples, still)
             with self._timed('optimise'):

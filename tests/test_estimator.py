@@ -102,7 +102,7 @@ def test_blindness_longer_than_allowed_is_a_failure_that_says_so(moving):
 
     *_, failures = run(moving, Options(max_blind_s=1.0), blind)
     assert not any(failures[:70])
-    assert 'no features' in failures[-1]
+    assert 'nothing followed' in failures[-1]
 
 
 def test_covariance_grows_with_distance_and_bounds_the_error(moving):

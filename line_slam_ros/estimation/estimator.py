@@ -15,7 +15,7 @@ from line_slam_ros.factors.line_reprojection import world_line
 from line_slam_ros.types import F64, I64, Calibration, Observations, Samples
 
 MAX_GYRO_BIAS, MAX_ACCEL_BIAS, MAX_SPEED = 0.5, 2.5, 50.0  # rad/s, m/s^2, m/s: beyond, the estimate is nonsense
-MIN_FEATURES = 6  # fewer in view and the camera is blind
+MIN_FEATURES = 6  # fewer that an earlier state saw, too, and the camera is blind
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +240,8 @@ class Estimator:
             return f'estimated speed {speed:.0f} m/s'
         if np.linalg.norm(w.b[k, :3]) > MAX_GYRO_BIAS or np.linalg.norm(w.b[k, 3:]) > MAX_ACCEL_BIAS:
             return f'estimated IMU biases {w.b[k].round(2).tolist()} rad/s, m/s^2'
-        if w.points.seen[:w.points.count, k].sum() + w.lines.seen[:w.lines.count, k].sum() >= MIN_FEATURES:
+        followed = [t.seen[:t.count, k] & t.seen[:t.count, :k].any(axis=1) for t in (w.points, w.lines)]
+        if sum(int(f.sum()) for f in followed) >= MIN_FEATURES:
             self._last_sight_ns = w.t_ns[k]
         blind = (w.t_ns[k] - self._last_sight_ns) * 1e-9
-        return f'no features for {blind:.1f} s' if blind > self.options.max_blind_s else ''
+        return f'nothing followed from image to image for {blind:.1f} s' if blind > self.options.max_blind_s else ''

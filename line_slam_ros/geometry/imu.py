@@ -109,3 +109,12 @@ def between(imu: ImuBatch, start_ns: int, end_ns: int) -> tuple[F64, F64, F64]:
     columns = [np.interp(t, source, c) for c in (*imu.gyro_B.T, *imu.accel_B.T)]
     samples = np.ascontiguousarray(np.stack(columns, axis=1))
     return t, np.ascontiguousarray(samples[:, :3]), np.ascontiguousarray(samples[:, 3:])
+
+
+def longest_gap(imu: ImuBatch, start_ns: int, end_ns: int) -> float:
+    """Longest time (s) within [start_ns, end_ns] without a sample."""
+    inside = imu.t_ns[(imu.t_ns > start_ns) & (imu.t_ns < end_ns)]
+    before = imu.t_ns[imu.t_ns <= start_ns][-1:]
+    after = imu.t_ns[imu.t_ns >= end_ns][:1]
+    times = np.concatenate([before if len(before) else [start_ns], inside, after if len(after) else [end_ns]])
+    return float(np.diff(times).max()) * 1e-9

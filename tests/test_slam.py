@@ -1,0 +1,136 @@
+"""Slam as the shells see it, with a front end that hands out simulated observations instead of looking at images."""
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from line_slam_ros.config import Config
+from line_slam_ros.config import Points as PointOptions
+from line_slam_ros.simulation.features import Room, Sequence, Trajectory, calibration
+from line_slam_ros.slam import Slam
+from line_slam_ros.types import Frame, ImuBatch, Status
+
+BLACK = np.zeros((480, 640), np.uint8)
+
+
+class Told:
+    """A front end that sees what it is told; forgotten ids do not come back."""
+
+    def __init__(self):
+        self.next, self.gone, self.turns = None, set(), []
+
+    def track(self, frame, R_CnCp):
+        self.turns.append(R_CnCp)
+        points = self.next.points
+        kept = ~np.isin(points.ids, list(self.gone))
+        return replace(self.next, points=replace(points, ids=points.ids[kept], uv=points.uv[kept], x=points.x[kept]))
+
+    def forget(self, point_ids, line_ids):
+        self.gone.update(point_ids.tolist())
+
+    def reset(self):
+        self.gone.clear()
+
+
+@pytest.fixture
+def slam():
+    made = Slam(Config(points=PointOptions(max_count=600)), calibration())
+    made.front_end = Told()
+    return made
+
+
+def feed(slam, sequence, change=lambda t, observations, imu: (observations, imu)):
+    """Runs a sequence through; returns (t s, estimate or None, status, waiting_for) of every frame."""
+    out = []
+    for observations, imu in sequence:
+        observations, imu = change(observations.t_ns * 1e-9, observations, imu)
+        slam.front_end.next = observations
+        estimate = slam.process(Frame(observations.t_ns, BLACK), imu)
+        out.append((observations.t_ns * 1e-9, estimate, slam.status, slam.waiting_for))
+    return out
+
+
+@pytest.fixture
+def sequence():
+    return Sequence(Trajectory.random(6), Room.random(6), calibration(), 8.0)
+
+
+def test_nothing_is_estimated_until_initialised_and_it_says_what_it_waits_for(slam, sequence):
+    out = feed(slam, sequence)
+    started = next(k for k, (_, e, *_) in enumerate(out) if e is not None)
+    assert out[started][0] <= 3.0
+    assert all(e is None and status is Status.INITIALISING and waits for _, e, status, waits in out[:started])
+    assert all(e is not None and status is Status.TRACKING and not waits for _, e, status, waits in out[started:])
+
+
+def test_estimate_has_velocity_rate_biases_and_a_positive_covariance(slam, sequence):
+    t, estimate, *_ = feed(slam, sequence)[-1]
+    R, _, v, omega, _ = sequence.trajectory.at(np.array([t]))
+    assert np.linalg.norm(estimate.v_W) == pytest.approx(np.linalg.norm(v[0]), abs=0.05)
+    np.testing.assert_allclose(estimate.omega_B, omega[0], atol=0.02)
+    np.testing.assert_allclose(estimate.gyro_bias, sequence.gyro_bias, atol=3e-3)
+    np.testing.assert_allclose(estimate.T_WB[2, :3], R[0, 2], atol=0.01)  # roll and pitch are absolute
+    assert np.linalg.eigvalsh(estimate.cov).min() > 0.0
+
+
+def test_lines_reach_the_map_where_they_are(slam, sequence):
+    feed(slam, sequence)
+    mapped, truth = slam.line_map.segments(), sequence.room.lines
+    assert len(mapped) >= 15
+    n_est, n_true = mapped.ends[:, 1] - mapped.ends[:, 0], (truth[:, 1] - truth[:, 0])[mapped.ids]
+    lengths = np.linalg.norm(n_est, axis=1), np.linalg.norm(n_true, axis=1)
+    assert np.median(lengths[0] / lengths[1]) == pytest.approx(1.0, abs=0.05)
+    vertical = np.abs(n_true[:, 2]) / lengths[1] > 0.99  # heading is free, but upright stays upright
+    assert vertical.any()
+    assert np.median(np.abs(n_est[vertical, 2]) / lengths[0][vertical]) > 0.999
+
+
+def test_the_front_end_gets_the_rotation_that_the_gyro_measured(slam, sequence):
+    feed(slam, sequence)
+    R_BC = slam.calibration.T_BC[:3, :3]
+    R = sequence.trajectory.at(np.array([7.90, 7.95]))[0]
+    assert slam.front_end.turns[0] is None
+    np.testing.assert_allclose(slam.front_end.turns[-1], (R[1] @ R_BC).T @ (R[0] @ R_BC), atol=2e-3)
+
+
+def test_an_inertial_gap_is_lost_and_tracking_resumes_from_the_last_pose(slam, sequence):
+    def gap(t, observations, imu):
+        if 4.0 < t <= 4.5:
+            kept = (imu.t_ns * 1e-9 < 4.0) | (imu.t_ns * 1e-9 > 4.45)
+            imu = ImuBatch(imu.t_ns[kept], imu.gyro_B[kept], imu.accel_B[kept])
+            if len(imu.t_ns) < 2:
+                imu = ImuBatch(np.array([0, observations.t_ns]), np.zeros((2, 3)), np.zeros((2, 3)))
+        return observations, imu
+
+    out = feed(slam, sequence, gap)
+    lost = [k for k, (*_, status, _) in enumerate(out) if status is Status.LOST]
+    assert lost and 'no inertial data' in out[lost[0]][3] and slam.resets >= 1
+    assert out[-1][2] is Status.TRACKING
+    before = next(e for _, e, *_ in reversed(out[:lost[0]]) if e is not None)
+    after = next(e for _, e, *_ in out[lost[-1] + 1:] if e is not None)
+    assert np.linalg.norm(after.T_WB[:3, 3] - before.T_WB[:3, 3]) < 2.0
+
+
+def test_reset_starts_anew_at_the_origin_with_an_empty_map(slam, sequence):
+    feed(slam, sequence)
+    slam.reset('time jumped back')
+    assert (slam.status, slam.waiting_for, slam.resets) == (Status.INITIALISING, 'time jumped back', 1)
+    assert len(slam.line_map.segments()) == 0
+    out = feed(slam, sequence)
+    first = next(e for _, e, *_ in out if e is not None)
+    assert np.linalg.norm(first.T_WB[:3, 3]) < 2.0 and out[-1][2] is Status.TRACKING
+
+
+def test_frames_must_be_newer_than_the_last(slam, sequence):
+    feed(slam, replace(sequence, seconds=1.0))
+    with pytest.raises(ValueError, match='between'):
+        feed(slam, replace(sequence, seconds=0.2))
+
+
+def test_same_input_gives_the_same_numbers(sequence):
+    def poses():
+        slam = Slam(Config(points=PointOptions(max_count=600)), calibration())
+        slam.front_end = Told()
+        return [e.T_WB for _, e, *_ in feed(slam, replace(sequence, seconds=4.0)) if e is not None]
+
+    np.testing.assert_array_equal(poses(), poses())
