@@ -10,7 +10,7 @@ from line_slam_ros.config import Checked, param
 class Node(Checked):
     """The live node only: quality of service, rates, where files go."""
 
-    reliability: str = param('best_effort', 'of the sensor subscriptions; best_effort also receives from reliable publishers',
+    reliability: str = param('best_effort', 'of sensor subscriptions; best_effort also hears reliable publishers',
                              choices=('best_effort', 'reliable'))
     map_path: str = param('line_map', '~/save_map writes this path with .ply and .csv appended')
     map_rate: float = param(4.0, 'most line markers and point clouds per second of sensor time, Hz', 0.1, 100.0)

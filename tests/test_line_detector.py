@@ -31,7 +31,7 @@ def test_the_brighter_side_lies_along_the_normal(detector):
     for ends in detector.detect(image, 40.0):
         t = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
         side = ends.mean(axis=0) + 4.0 * np.array([-t[1], t[0]])
-        assert image[int(round(side[1])), int(round(side[0]))] > 150
+        assert image[round(side[1]), round(side[0])] > 150
 
 
 def test_orientation_does_not_depend_on_the_order_given():

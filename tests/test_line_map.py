@@ -144,7 +144,7 @@ def test_ends_follow_a_refined_estimate(rng):
     assert (ends[1] - ends[0]) @ (B - A) > 0  # a direction turned round by the estimator does not swap the ends
 
 
-@pytest.mark.parametrize('change', [dict(sigma=0.2), dict(views=3), dict(part=lambda k: (0.5, 0.51))])
+@pytest.mark.parametrize('change', [{'sigma': 0.2}, {'views': 3}, {'part': lambda k: (0.5, 0.51)}])
 def test_doubtful_lines_are_neither_shown_nor_kept(rng, change):
     line_map = LineMap(Mapping())
     add(line_map, rng, 0, A, B, **change)

@@ -48,7 +48,7 @@ def test_an_empty_map_finds_nothing_and_has_no_precision():
 def test_samples_weigh_the_whole_length():
     rng = np.random.default_rng(0)
     some = rng.normal(size=(30, 2, 3))
-    samples, owner, weight = sampled(some)
+    _, owner, weight = sampled(some)
     np.testing.assert_allclose(np.bincount(owner, weight), np.linalg.norm(some[:, 1] - some[:, 0], axis=1))
     assert weight.max() <= 0.01 + 1e-12
 

@@ -63,8 +63,8 @@ def _line_rows(lines: dict[str, Any] | None) -> list[tuple[str, str]]:
     rows = [('lines', f'{lines["count"]}, mean length {lines["mean_length"]:.2f} m, {lines["duplicates"]} duplicates')]
     for t, precision, recall, metres in zip(lines['thresholds'], lines['precision'], lines['recall'],
                                             lines['recall_m'], strict=True):
-        rows.append((f'within {100 * t:g} cm', f'precision {100 * precision:.1f} %, '
-                                               f'recall {100 * recall:.1f} % ({metres:.1f} m)'))
+        figures = f'precision {100 * precision:.1f} %, recall {100 * recall:.1f} % ({metres:.1f} m)'
+        rows.append((f'within {100 * t:g} cm', figures))
     return rows
 
 

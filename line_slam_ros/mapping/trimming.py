@@ -78,7 +78,7 @@ def _line_in_camera(n, d, pose):
 @njit(cache=True, nogil=True, error_model='numpy')
 def _runs_backwards(n, d, pose, ends):
     """Whether the observed segment points against the image of d, whatever the order of its ends."""
-    n0, n1, n2, d0, d1, d2, _ = _line_in_camera(n, d, pose)
+    _, _, _, d0, d1, d2, _ = _line_in_camera(n, d, pose)
     u, v = 0.5 * (ends[0, 0] + ends[1, 0]), 0.5 * (ends[0, 1] + ends[1, 1])
     return (ends[1, 0] - ends[0, 0]) * (d0 - u * d2) + (ends[1, 1] - ends[0, 1]) * (d1 - v * d2) < 0.0
 

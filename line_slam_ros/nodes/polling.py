@@ -5,8 +5,10 @@ import threading
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.subscription import Subscription
 
+InvalidHandle = rclpy_implementation.InvalidHandle
 PERIOD_S = 0.005
 
 
@@ -37,12 +39,19 @@ class Poller:
         self._thread.start()
 
     def stop(self) -> None:
-        """To be called before the subscription is destroyed."""
+        """Ends the thread; a subscription that is destroyed first ends it, too."""
         self._ended.set()
         self._thread.join()
 
     def _run(self) -> None:
         while not self._ended.wait(PERIOD_S):
-            with self._subscription.handle:
-                while (taken := self._subscription.handle.take_message(self._subscription.msg_type, False)) is not None:
-                    self._subscription.callback(taken[0])
+            try:
+                self._hand_over()
+            except InvalidHandle:
+                return
+
+    def _hand_over(self) -> None:
+        handle = self._subscription.handle
+        with handle:
+            while (taken := handle.take_message(self._subscription.msg_type, False)) is not None:
+                self._subscription.callback(taken[0])
