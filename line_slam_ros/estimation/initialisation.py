@@ -8,6 +8,7 @@ CVPR 2023), then velocity, gravity and the points solve one linear system with |
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numba import njit
@@ -15,7 +16,10 @@ from scipy.optimize import brentq, least_squares
 
 from line_slam_ros.geometry.imu import preintegrate
 from line_slam_ros.geometry.lie import so3_exp
+from line_slam_ros.geometry.lie_kernels import exp_so3, multiply, multiply_transposed
 from line_slam_ros.types import F64, ImuNoise, Observations, Samples
+
+BIAS_STEP = 1e-4  # rad/s, of the difference quotient
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,18 +128,44 @@ def _coplanarity(x, y, R):
     return max(np.linalg.eigvalsh(M)[0], 0.0) / max(len(x), 1)
 
 
+@njit(cache=True, nogil=True, error_model='numpy')
+def _disagreement(bias, x, y, first, dR, J, R_BC):
+    """Root coplanarity (P,) of P frame pairs, rotations corrected for a gyro bias (3,).
+
+    Matches x, y (N, 2) of pair k stand from first[k] to first[k + 1]; dR (P, 3, 3) and J (P, 3, 3) are
+    the preintegrated rotation and its derivative by the bias.
+    """
+    out = np.empty(len(dR))
+    turn, E, A, R = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    for k in range(len(dR)):
+        for i in range(3):
+            turn[i] = J[k, i, 0] * bias[0] + J[k, i, 1] * bias[1] + J[k, i, 2] * bias[2]
+        exp_so3(turn, E)
+        multiply(dR[k], E, A)
+        multiply(A, R_BC, E)
+        multiply_transposed(R_BC, E, R)
+        out[k] = np.sqrt(_coplanarity(x[first[k]:first[k + 1]], y[first[k]:first[k + 1]], R) + 1e-14)
+    return out
+
+
 def _gyro_bias(shots: list[Snapshot], links: list[tuple], R_BC: F64) -> F64:
     pairs = [(*matches(a.observations, b.observations), link)
-             for a, b, link in zip(shots[:-1], shots[1:], links, strict=True)]
+             for (a, b), link in zip(pairwise(shots), links, strict=True)]
     pairs = [p for p in pairs if len(p[0]) >= 10]
     if not pairs:
         return np.zeros(3)
+    x, y = (np.concatenate([p[i] for p in pairs]) for i in (0, 1))
+    first = np.cumsum([0, *(len(p[0]) for p in pairs)])
+    dR, J = (np.array([part(p[2]) for p in pairs]) for part in (lambda link: link[1], lambda link: link[4][:3, :3]))
+    given = x, y, first, dR, J, np.ascontiguousarray(R_BC)
 
-    def residuals(bias: F64) -> F64:
-        return np.array([np.sqrt(_coplanarity(x, y, R_BC.T @ link[1] @ so3_exp(link[4][:3, :3] @ bias) @ R_BC) + 1e-14)
-                         for x, y, link in pairs])
+    def slopes(bias: F64) -> F64:
+        steps = BIAS_STEP * np.eye(3)
+        return np.stack([(_disagreement(bias + h, *given) - _disagreement(bias - h, *given)) / (2.0 * BIAS_STEP)
+                         for h in steps], axis=1)
 
-    return least_squares(residuals, np.zeros(3), diff_step=1e-3, x_scale=1e-2, loss='soft_l1', f_scale=1e-3).x
+    return least_squares(lambda bias: _disagreement(bias, *given), np.zeros(3), slopes, x_scale=1e-2, loss='soft_l1',
+                         f_scale=1e-3, xtol=1e-4, ftol=1e-6, max_nfev=30).x
 
 
 def _velocity_and_gravity(shots: list[Snapshot], motion: _Motion, T_BC: F64, gravity: float) -> tuple[F64, F64] | None:
