@@ -16,7 +16,7 @@ def tracker():
 
 
 def see(tracker, image, R=None):
-    tracker.undistort(image)
+    tracker.take(image)
     tracker.track(R, *NO_CORNERS)
     tracker.detect()
     return tracker.observations()
@@ -78,7 +78,7 @@ def test_corners_nearby_tell_how_a_new_segment_moves(tracker):
     scene = step_edge(160.0, 120.0, 0.0)
     see(tracker, view(scene, np.eye(3)))
     H = homography([0.0, 0.0, 0.0], [0.0, -0.25, 0.0])  # 25 px, beyond the search
-    tracker.undistort(view(scene, H))
+    tracker.take(view(scene, H))
     tracker.track(np.eye(3), np.zeros((4, 2)), np.tile([0.0, 0.125], (4, 1)))
     assert tracker.observations().ids.tolist() == [0]
     np.testing.assert_allclose(pixels(tracker.observations().ends[0])[:, 1], 145.0, atol=0.15)
@@ -129,3 +129,14 @@ def test_tracks_end_on_an_empty_image(tracker, grey):
 
 def test_none_are_wanted():
     assert not len(see(LineTracker(pinhole(), Lines(max_count=0)), view(mosaic(), np.eye(3))).ids)
+
+
+@pytest.mark.parametrize('pace', [1.0, 3.0])
+def test_motion_goes_on_as_long_as_the_image_takes(tracker, pace):
+    scene = step_edge(160.0, 120.0, 0.0)
+    for k in range(3):
+        see(tracker, view(scene, homography([0.0, 0.0, 0.0], [0.0, -0.06 * k, 0.0])), np.eye(3))  # 6 px per image
+    tracker.take(view(scene, homography([0.0, 0.0, 0.0], [0.0, -0.06 * (2.0 + pace), 0.0])))
+    tracker.track(np.eye(3), *NO_CORNERS, pace)
+    assert tracker.observations().ids.tolist() == [0]
+    np.testing.assert_allclose(pixels(tracker.observations().ends[0])[:, 1], 132.0 + 6.0 * pace, atol=0.15)

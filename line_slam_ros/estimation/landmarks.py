@@ -22,6 +22,17 @@ def cauchy(s, c2):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
+def _weigh(r, sigma, c2, J_pose, scale):
+    """Whiten r (2,) by sigma (2,) and weigh it robustly, J_pose (2, 6) alike; scale (2,) is what to multiply by."""
+    _, w = cauchy((r[0] / sigma[0]) ** 2 + (r[1] / sigma[1]) ** 2, c2)
+    for k in range(2):
+        scale[k] = np.sqrt(w) / sigma[k]
+        r[k] *= scale[k]
+        for j in range(6):
+            J_pose[k, j] *= scale[k]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
 def _invert_spd(A, d, L):
     """A (d, d) -> its inverse in place by Cholesky, L is scratch. False when A is not positive definite."""
     for j in range(d):
@@ -121,6 +132,7 @@ def add_points(n, R, p, R0, p0, R_BC, p_BC, use, seen, z, sigma, abr, R_WA, p_WA
     """
     r, q, J_pose, J_ext, J_p = np.empty(2), np.empty(2), np.empty((2, 6)), np.empty((2, 6)), np.empty((2, 3))
     p_W, C, J, Y, L = np.empty(3), np.empty((3, 3)), np.empty((2, 3)), np.empty((6, 3)), np.empty((3, 3))
+    scale = np.empty(2)
     for i in range(len(use)):
         A[i], a[i] = 0.0, 0.0
         if not use[i]:
@@ -134,18 +146,10 @@ def add_points(n, R, p, R0, p0, R_BC, p_BC, use, seen, z, sigma, abr, R_WA, p_WA
                 continue
             if not point_reprojection(R0[f], p0[f], R_BC, p_BC, p_W, z[i, f], q, J_pose, J_ext, J_p):
                 continue
-            w0, w1 = 1.0 / sigma[i, f, 0], 1.0 / sigma[i, f, 1]
-            r[0] *= w0
-            r[1] *= w1
-            _, w = cauchy(r[0] * r[0] + r[1] * r[1], c2)
-            w = np.sqrt(w)
+            _weigh(r, sigma[i, f], c2, J_pose, scale)
             for k in range(2):
-                s = w * (w0 if k == 0 else w1)
-                r[k] *= w
-                for j in range(6):
-                    J_pose[k, j] *= s
                 for j in range(3):
-                    J[k, j] = s * (J_p[k, 0] * C[0, j] + J_p[k, 1] * C[1, j] + J_p[k, 2] * C[2, j])
+                    J[k, j] = scale[k] * (J_p[k, 0] * C[0, j] + J_p[k, 1] * C[1, j] + J_p[k, 2] * C[2, j])
             _add_observation(f, 3, r, J_pose, J, H, g, E[i], A[i], a[i])
         A[i, 2, 2] += w_rho * w_rho
         a[i, 2] += w_rho * w_rho * (abr[i, 2] - rho0)
@@ -158,7 +162,7 @@ def add_lines(n, R, p, R0, p0, R_BC, p_BC, use, seen, z, sigma, host, U, phi, rh
     """As add_points, for lines in either form (see world_line): E (M, n, 6, 4), A (M, 4, 4), a (M, 4)."""
     r, q, J_pose, J_ext, J_l = np.empty(2), np.empty(2), np.empty((2, 6)), np.empty((2, 6)), np.empty((2, 6))
     n_W, d_W, C = np.empty(3), np.empty(3), np.empty((6, 4))
-    J, Y, L = np.empty((2, 4)), np.empty((6, 4)), np.empty((4, 4))
+    J, Y, L, scale = np.empty((2, 4)), np.empty((6, 4)), np.empty((4, 4)), np.empty(2)
     for i in range(len(use)):
         A[i], a[i] = 0.0, 0.0
         if not use[i]:
@@ -172,20 +176,12 @@ def add_lines(n, R, p, R0, p0, R_BC, p_BC, use, seen, z, sigma, host, U, phi, rh
                 continue
             if not line_reprojection(R0[f], p0[f], R_BC, p_BC, n_W, d_W, z[i, f], q, J_pose, J_ext, J_l):
                 continue
-            w0, w1 = 1.0 / sigma[i, f, 0], 1.0 / sigma[i, f, 1]
-            r[0] *= w0
-            r[1] *= w1
-            _, w = cauchy(r[0] * r[0] + r[1] * r[1], c2)
-            w = np.sqrt(w)
+            _weigh(r, sigma[i, f], c2, J_pose, scale)
             for k in range(2):
-                s = w * (w0 if k == 0 else w1)
-                r[k] *= w
-                for j in range(6):
-                    J_pose[k, j] *= s
                 for j in range(4):
                     J[k, j] = 0.0
                     for m in range(6):
-                        J[k, j] += s * J_l[k, m] * C[m, j]
+                        J[k, j] += scale[k] * J_l[k, m] * C[m, j]
             _add_observation(f, 4, r, J_pose, J, H, g, E[i], A[i], a[i])
         for j in range(4):
             A[i, j, j] += 1.0  # one radian of doubt: a line without parallax stays put instead of being singular

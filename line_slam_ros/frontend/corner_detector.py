@@ -12,14 +12,14 @@ MARGIN = 8  # px of the half-size image without corners
 SETTLE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 10, 0.02)
 
 
-def new_corners(image: U8, half_size: np.ndarray, tracked: F64, count: int, min_distance: float, cell: float,
+def new_corners(image: U8, half_size: U8, tracked: F64, count: int, min_distance: float, cell: float,
                 contrast: float) -> F64:
     """Up to count sub-pixel corners (N, 2) px of image (H, W), min_distance px from each other and from tracked.
 
-    Found on half_size (H/2, W/2) float32 as local maxima of the smaller eigenvalue of the structure tensor (Shi and
+    Found on half_size (H/2, W/2) as local maxima of the smaller eigenvalue of the structure tensor (Shi and
     Tomasi, 1994) above contrast^2; cells (side cell px) that hold fewer corners go first.
     """
-    score = np.zeros_like(half_size)
+    score = np.zeros(half_size.shape, np.float32)
     corner_score(half_size, contrast * contrast, score)
     found = spread(score, np.ascontiguousarray(tracked), count, min_distance, cell)
     if not len(found):
@@ -40,7 +40,7 @@ def corner_score(image, floor, score):
         old = rows[y % size]
         up, row, low = image[y - 1], image[y], image[y + 1]
         for x in range(1, w - 1):
-            gx, gy = row[x + 1] - row[x - 1], low[x] - up[x]
+            gx, gy = np.float32(row[x + 1]) - row[x - 1], np.float32(low[x]) - up[x]
             xx, xy, yy = gx * gx, gx * gy, gy * gy
             total[0, x] += xx - old[0, x]
             total[1, x] += xy - old[1, x]

@@ -1,108 +1,168 @@
 """Compiled kernels that find and measure straight edges across their normals.
 
-Pixels are those of the undistorted image. A segment runs from ends[0] to ends[1] and is always brighter on the side of
-its normal (-t_v, t_u), which fixes the order of its ends. ``valid`` marks the pixels that the lens really saw.
+Pixels are those of an undistorted canvas. No such image is made: ``lens`` (H, W, 2) tells where each LENS_STEP-th pixel
+of the canvas lies in ``image``, the image as received (NaN where the lens does not see). A segment runs from ends[0] to
+ends[1] and is always brighter on the side of its normal (-t_v, t_u), which fixes the order of its ends.
 """
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
+LENS_STEP = 4  # px, of the table of the lens; between, it is linear to 0.01 px
+BORDER = 4.0  # px of the received image that are not trusted
 SAMPLES = 32  # across-profiles per segment
 HALF = 6  # px, half length of a remembered profile
 SEARCH = 10  # px, largest displacement across the segment that is looked for around the prediction
 TILT = 4  # px, largest difference of displacement between the middle and an end
+LANES = 32  # at least 2 (SEARCH + TILT) + 1 displacements; what processors like, the rest is not used
 INERTIA = 0.002  # loss of correlation per px that a farther place must make up for
-DIM = 5.0  # grey, norm of a profile below which its correlation counts little
+DIM = np.float32(5.0)  # grey, norm of a profile below which its correlation counts little
 PEAK = 3  # px, the edge is looked for this far from its expected place
 
 
-@njit(cache=True, nogil=True, error_model='numpy', inline='always')
-def bilinear(image, u, v):
-    """Grey value at (u, v), which the caller knows to lie inside."""
-    c, r = int(u), int(v)
-    a, b = u - c, v - r
-    top = image[r, c] + a * (np.float64(image[r, c + 1]) - image[r, c])
-    low = image[r + 1, c] + a * (np.float64(image[r + 1, c + 1]) - image[r + 1, c])
-    return top + b * (low - top)
+@njit(cache=True, nogil=True, error_model='numpy')
+def received(lens, u, v, nu, nv):
+    """Where (u, v) of the canvas lies in the received image, and what a step (nu, nv) becomes there; NaN if unseen."""
+    a, b = u * (1.0 / LENS_STEP), v * (1.0 / LENS_STEP)
+    if not (a >= 0.0 and b >= 0.0 and a < lens.shape[1] - 1.0 and b < lens.shape[0] - 1.0):
+        return np.nan, np.nan, np.nan, np.nan
+    c0, r0 = np.uintp(int(a)), np.uintp(int(b))
+    c1, r1 = np.uintp(int(a) + 1), np.uintp(int(b) + 1)
+    a, b = a - int(a), b - int(b)
+    nu, nv = nu * (1.0 / LENS_STEP), nv * (1.0 / LENS_STEP)
+    low_u, low_v = lens[r0, c0, 0] + b * (lens[r1, c0, 0] - lens[r0, c0, 0]), \
+        lens[r0, c0, 1] + b * (lens[r1, c0, 1] - lens[r0, c0, 1])
+    high_u, high_v = lens[r0, c1, 0] + b * (lens[r1, c1, 0] - lens[r0, c1, 0]), \
+        lens[r0, c1, 1] + b * (lens[r1, c1, 1] - lens[r0, c1, 1])
+    down_u = (1.0 - a) * (lens[r1, c0, 0] - lens[r0, c0, 0]) + a * (lens[r1, c1, 0] - lens[r0, c1, 0])
+    down_v = (1.0 - a) * (lens[r1, c0, 1] - lens[r0, c0, 1]) + a * (lens[r1, c1, 1] - lens[r0, c1, 1])
+    return (low_u + a * (high_u - low_u), low_v + a * (high_v - low_v),
+            nu * (high_u - low_u) + nv * down_u, nu * (high_v - low_v) + nv * down_v)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def strip(image, valid, end0, end1, half, values):
-    """Fill values (SAMPLES, 2 half + 1) with grey across the segment; a row starts with NaN outside the image."""
-    h, w = image.shape
-    du, dv = end1[0] - end0[0], end1[1] - end0[1]
+def trusted(image, u, v):
+    """Does the received pixel (u, v) lie in the image, a border left out?"""
+    return u >= BORDER and v >= BORDER and u < image.shape[1] - 1.0 - BORDER and v < image.shape[0] - 1.0 - BORDER
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def across(image, lens, u, v, nu, nv, half, row):
+    """Fill row (2 half + 1,) with grey at (u, v) + k (nu, nv), |k| <= half; False when it leaves the image.
+
+    The lens is taken as linear around (u, v): what lies a pixel from there, as measured edges do, is out of place by
+    some 0.001 px, what lies 10 px from there by 0.1 px. Positions advance in steps counted in 2^-32 px.
+    """
+    mu, mv, du, dv = received(lens, u, v, nu, nv)
+    if not (trusted(image, mu - half * du, mv - half * dv) and trusted(image, mu + half * du, mv + half * dv)):
+        return False
+    flat, w, unit = image.reshape(-1), image.shape[1], np.float32(2.0**-32)
+    right, below = np.uintp(1), np.uintp(w)
+    cu, cv = int((mu - half * du) * 2.0**32), int((mv - half * dv) * 2.0**32)
+    step_u, step_v = int(du * 2.0**32), int(dv * 2.0**32)
+    for k in range(2 * half + 1):
+        at = np.uintp((cv >> 32) * w + (cu >> 32))
+        a, b = np.float32(cu & 0xFFFFFFFF) * unit, np.float32(cv & 0xFFFFFFFF) * unit
+        top, low = np.float32(flat[at]), np.float32(flat[at + below])
+        top += a * (np.float32(flat[at + right]) - top)
+        low += a * (np.float32(flat[at + below + right]) - low)
+        row[k] = top + b * (low - top)
+        cu += step_u
+        cv += step_v
+    return True
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def strip(image, lens, ends, half, values):
+    """Fill values (SAMPLES, 2 half + 1) with grey across a segment (2, 2); a row starts with NaN outside the image."""
+    du, dv = ends[1, 0] - ends[0, 0], ends[1, 1] - ends[0, 1]
     length = np.sqrt(du * du + dv * dv) + 1e-12
-    nu, nv = -dv / length, du / length
     for i in range(SAMPLES):
         s = (i + 0.5) / SAMPLES
-        u, v = end0[0] + s * du, end0[1] + s * dv
-        values[i, 0] = np.nan
-        au, av, bu, bv = u - half * nu, v - half * nv, u + half * nu, v + half * nv
-        if not (min(au, bu) >= 1.0 and min(av, bv) >= 1.0 and max(au, bu) < w - 2.0 and max(av, bv) < h - 2.0):
-            continue
-        if not (valid[int(av), int(au)] and valid[int(bv), int(bu)]):
-            continue
-        for k in range(2 * half + 1):
-            values[i, k] = bilinear(image, au + k * nu, av + k * nv)
+        if not across(image, lens, ends[0, 0] + s * du, ends[0, 1] + s * dv, -dv / length, du / length, half,
+                      values[i]):
+            values[i, 0] = np.nan
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def remember(image, valid, ends, profiles):
+def remember(image, lens, ends, profiles):
     """Fill profiles (M, SAMPLES, 2 HALF + 1), zero mean and unit norm, of segments ends (M, 2, 2)."""
+    width = 2 * HALF + 1
     for m in range(len(ends)):
-        strip(image, valid, ends[m, 0], ends[m, 1], HALF, profiles[m])
+        strip(image, lens, ends[m], HALF, profiles[m])
         for i in range(SAMPLES):
-            row = profiles[m, i]
-            if row[0] == row[0]:
-                row -= np.mean(row)
-                row /= np.sqrt(np.sum(row * row)) + DIM
+            row, total, square = profiles[m, i], np.float32(0.0), np.float32(0.0)
+            for k in range(width):
+                total += row[k]
+            for k in range(width):
+                row[k] -= total / np.float32(width)
+                square += row[k] * row[k]
+            for k in range(width):
+                row[k] /= np.sqrt(square) + DIM
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def follow(image, valid, profiles, ends, score):
+def correlate(values, profiles, table):
+    """Fill table (SAMPLES, LANES) with the correlations of profiles (SAMPLES, K) and values (SAMPLES, LANES + K) at j.
+
+    Negative ones become 0, and all of a row that cannot be compared. Returns the number of those that can.
+    """
+    width, zero = profiles.shape[1], np.float32(0.0)
+    product, total, square = np.empty(LANES, np.float32), np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    usable = 0
+    for i in range(SAMPLES):
+        table[i] = zero
+        if not (values[i, 0] == values[i, 0] and profiles[i, 0] == profiles[i, 0]):
+            continue
+        usable += 1
+        product[:], total[:], square[:] = zero, zero, zero
+        for k in range(width):
+            grey, weight = values[i, k:k + LANES], profiles[i, k]
+            for j in range(LANES):
+                product[j] += grey[j] * weight
+                total[j] += grey[j]
+                square[j] += grey[j] * grey[j]
+        for j in range(LANES):
+            rest = max(square[j] - total[j] * total[j] / np.float32(width), zero)
+            table[i, j] = max(product[j], zero) / (np.sqrt(rest) + DIM)
+    return usable
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def best_shift(table, usable):
+    """(mean correlation, a, b) of the best displacement a + b s, s from -1 to 1 along the samples of table."""
+    total = np.empty(LANES - 2 * TILT, np.float32)
+    best, best_a, best_b = -np.inf, 0, 0
+    for b in range(-TILT, TILT + 1):
+        total[:] = np.float32(0.0)
+        for i in range(SAMPLES):
+            first = int(np.floor(b * (2.0 * (i + 0.5) / SAMPLES - 1.0) + 0.5)) + TILT
+            row = table[i, first:]
+            for j in range(LANES - 2 * TILT):
+                total[j] += row[j]
+        for j in range(2 * SEARCH + 1):
+            value = total[j] / usable - INERTIA * (abs(j - SEARCH) + 2.0 * abs(b))
+            if value > best:
+                best, best_a, best_b = value, j - SEARCH, b
+    return best + INERTIA * (abs(best_a) + 2.0 * abs(best_b)), best_a, best_b
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def follow(image, lens, profiles, ends, score):
     """Shift predicted segments ends (M, 2, 2), in place, to where their profiles (M, SAMPLES, 2 HALF + 1) fit best.
 
-    Displacement of sample i: a + b s_i with s from -1 to 1; all (a, b) are tried on one table of correlations.
-    score (M,): mean correlation at the best, counting only samples that could be compared; 0 when under half could.
+    score (M,): mean correlation there, counting only samples that could be compared; 0 when under half could.
     """
-    wide = SEARCH + TILT + HALF
-    values = np.empty((SAMPLES, 2 * wide + 1))
-    table = np.empty((SAMPLES, 2 * (SEARCH + TILT) + 1))
-    total, width = np.empty(2 * SEARCH + 1), 2 * HALF + 1
+    values = np.zeros((SAMPLES, LANES + 2 * HALF + 1), np.float32)
+    table = np.empty((SAMPLES, LANES), np.float32)
     for m in range(len(ends)):
-        strip(image, valid, ends[m, 0], ends[m, 1], wide, values)
-        usable = 0
-        for i in range(SAMPLES):
-            table[i, 0] = np.nan
-            if not (values[i, 0] == values[i, 0] and profiles[m, i, 0] == profiles[m, i, 0]):
-                continue
-            usable += 1
-            for j in range(table.shape[1]):
-                mean, square, product = 0.0, 0.0, 0.0
-                for k in range(width):
-                    g = values[i, j + k]
-                    mean += g / width
-                    square += g * g
-                    product += g * profiles[m, i, k]
-                table[i, j] = product / (np.sqrt(max(square - width * mean * mean, 0.0)) + DIM)
+        strip(image, lens, ends[m], SEARCH + TILT + HALF, values)
+        usable = correlate(values, profiles[m], table)
         score[m] = 0.0
-        if usable < SAMPLES // 2:
-            continue
-        best, best_a, best_b = -np.inf, 0, 0
-        for b in range(-TILT, TILT + 1):
-            total[:] = 0.0
-            for i in range(SAMPLES):
-                if table[i, 0] == table[i, 0]:
-                    first = int(np.floor(b * (2.0 * (i + 0.5) / SAMPLES - 1.0) + 0.5)) + TILT
-                    for j in range(2 * SEARCH + 1):
-                        total[j] += max(table[i, first + j], 0.0)
-            for j in range(2 * SEARCH + 1):
-                value = total[j] / usable - INERTIA * (abs(j - SEARCH) + 2.0 * abs(b))
-                if value > best:
-                    best, best_a, best_b = value, j - SEARCH, b
-        score[m] = best + INERTIA * (abs(best_a) + 2.0 * abs(best_b))
-        shift(ends[m], best_a - best_b, best_a + best_b)
+        if usable >= SAMPLES // 2:
+            score[m], a, b = best_shift(table, usable)
+            shift(ends[m], a - b, a + b)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -169,20 +229,20 @@ def fit(offsets, heights, scale, line):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def measure(image, valid, floor, ends, variance, support):
+def measure(image, lens, floor, ends, variance, support):
     """Put segments ends (M, 2, 2) on the edge itself, in place, and on its visible extent.
 
     floor: smallest gradient, grey/px; variance (M, 2) px^2 of each end across the segment, support (M,) share of the
     samples that lie on the edge (below 0.3 the search ends and the rest is not filled in).
     """
     half = PEAK + 2
-    values = np.empty((SAMPLES, 2 * half + 1))
+    values = np.empty((SAMPLES, 2 * half + 1), np.float32)
     offsets, heights, line = np.empty(SAMPLES), np.empty(SAMPLES), np.zeros(5)
     for m in range(len(ends)):
         support[m] = 0.0
         for stage in range(2):
             reach = PEAK if stage == 0 else 1
-            strip(image, valid, ends[m, 0], ends[m, 1], half, values)
+            strip(image, lens, ends[m], half, values)
             for i in range(SAMPLES):
                 heights[i] = 0.0
                 if values[i, 0] == values[i, 0]:
@@ -195,27 +255,26 @@ def measure(image, valid, floor, ends, variance, support):
         if support[m] < 0.3:
             continue
         variance[m, 0], variance[m, 1] = line[2], line[3]
-        reach_ends(image, valid, ends[m], max(floor, 0.4 * np.median(heights[heights > 0.0])))
+        reach_ends(image, lens, ends[m], max(floor, 0.4 * np.median(heights[heights > 0.0])))
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def on_edge(image, valid, u, v, nu, nv, floor):
-    """Does a rising edge cross the normal (nu, nv) within a pixel of (u, v)?"""
-    h, w = image.shape
-    if not (u >= 5.0 and v >= 5.0 and u < w - 6.0 and v < h - 6.0 and valid[int(v), int(u)]):
+def on_edge(image, lens, u, v, nu, nv, floor, row):
+    """Does a rising edge cross the normal (nu, nv) within a pixel of (u, v)? row (7,): work space."""
+    if not across(image, lens, u, v, nu, nv, 3, row):
         return False
     best, where = -np.inf, 0
     for k in range(-2, 3):
-        ahead = bilinear(image, u + (k + 1) * nu, v + (k + 1) * nv)
-        g = 0.5 * (ahead - bilinear(image, u + (k - 1) * nu, v + (k - 1) * nv))
+        g = 0.5 * (row[k + 4] - row[k + 2])
         if g > best:
             best, where = g, k
     return best > floor and abs(where) <= 1
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def reach_ends(image, valid, ends, floor):
+def reach_ends(image, lens, ends, floor):
     """Let both ends grow (8 px at most) or shrink to where the edge is visible, in place."""
+    row = np.empty(7, np.float32)
     step, inward, outward, gap = 2.0, 24.0, 8.0, 3
     du, dv = ends[1, 0] - ends[0, 0], ends[1, 1] - ends[0, 1]
     length = np.sqrt(du * du + dv * dv) + 1e-12
@@ -226,7 +285,7 @@ def reach_ends(image, valid, ends, floor):
         start = -min(inward, 0.4 * length)
         last, missed, along = start, 0, start
         while along <= outward and missed <= gap:
-            if on_edge(image, valid, eu + sign * along * tu, ev + sign * along * tv, -tv, tu, floor):
+            if on_edge(image, lens, eu + sign * along * tu, ev + sign * along * tv, -tv, tu, floor, row):
                 last, missed = along, 0
             else:
                 missed += 1
@@ -253,10 +312,13 @@ def beside(ends, other, tolerance):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def duplicates(ends, tolerance, doubled):
-    """Mark in doubled (M,) every segment that lies, for a third of the shorter, on an earlier unmarked one."""
+def duplicates(ends, tolerance, of, doubled):
+    """Mark in doubled (M,) every segment that lies, for a third of the shorter, on an earlier unmarked one.
+
+    Only the first ``of`` segments count as earlier ones.
+    """
     for j in range(len(ends)):
-        for i in range(j):
+        for i in range(min(j, of)):
             if doubled[i]:
                 continue
             length = np.hypot(ends[i, 1, 0] - ends[i, 0, 0], ends[i, 1, 1] - ends[i, 0, 1])

@@ -12,6 +12,7 @@ from line_slam_ros.frontend.point_tracker import PointTracker
 from line_slam_ros.geometry.camera import Camera
 from line_slam_ros.types import F64, I64, U8, Frame, Observations
 
+LONGEST_PACE = 5.0  # motion is not extrapolated further
 OLD = 20  # images, age at which a drawn track has its final colour
 
 
@@ -23,6 +24,7 @@ class FrontEnd:
         self._points = PointTracker(camera, config.points)
         self._lines = LineTracker(camera, config.lines)
         self._image = np.zeros((camera.calibration.height, camera.calibration.width), np.uint8)
+        self._t_ns, self._elapsed_ns = 0, 0
         self.timings: dict[str, float] = {}
 
     def reset(self) -> None:
@@ -43,23 +45,26 @@ class FrontEnd:
         if frame.image.shape != self._image.shape:
             (h, w), (rows, columns) = self._image.shape, frame.image.shape[:2]
             raise ValueError(f'image is {columns}x{rows} px, the calibration is for {w}x{h}: use the one that fits')
-        self._image = np.ascontiguousarray(frame.image)
+        self._image = frame.image.copy(order='C')  # it is needed again when the next one comes
         times = [perf_counter()]
-        if self._config.use_lines:
-            self._lines.undistort(self._image)
-        times.append(perf_counter())
         if self._config.use_points:
             self._points.track(self._image, R_CnCp)
         if self._config.use_lines:
-            self._lines.track(R_CnCp, self._points.x_turned, self._points.motion_x)
+            self._lines.take(self._image)
+            self._lines.track(R_CnCp, self._points.x_turned, self._points.motion_x, self._pace(frame.t_ns))
         times.append(perf_counter())
         if self._config.use_points:
             self._points.detect()
         if self._config.use_lines:
             self._lines.detect()
         times.append(perf_counter())
-        self.timings = dict(zip(('undistort', 'track', 'detect'), np.diff(times).tolist(), strict=True))
+        self.timings = dict(zip(('track', 'detect'), np.diff(times).tolist(), strict=True))
         return Observations(frame.t_ns, self._points.observations(), self._lines.observations())
+
+    def _pace(self, t_ns: int) -> float:
+        """Time since the previous image in units of that before it; 1 when there was none, LONGEST_PACE at most."""
+        before, self._elapsed_ns, self._t_ns = self._elapsed_ns, t_ns - self._t_ns, t_ns
+        return min(self._elapsed_ns / before, LONGEST_PACE) if before > 0 and self._elapsed_ns > 0 else 1.0
 
     def draw(self) -> U8:
         """Newest image (H, W, 3) BGR with the tracks in it: new ones blue, old ones green (points) or red (lines)."""

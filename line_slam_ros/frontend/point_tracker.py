@@ -35,15 +35,15 @@ class Corners(Rows):
     ages: I64  # images since detection
     uv: F64  # (N, 2) px as received
     x: F64  # (N, 2) normalised
-    templates: NDArray[np.float32]  # (N, 3, SIZE, SIZE) the learned patch and its gradients
-    inverses: F64  # (N, 8, 8)
+    templates: NDArray[np.float32]  # (N, SIZE + 2, LANES + 2) the learned patch
+    inverses: F64  # (N, 6, 6)
     shapes: F64  # (N, 2, 2) affine map of the learned patch into the newest image
 
     @staticmethod
     def blank(n: int) -> Corners:
         """n rows, not filled in except ages and shapes."""
         return Corners(np.empty(n, np.int64), np.zeros(n, np.int64), np.empty((n, 2)), np.empty((n, 2)),
-                       np.empty((n, 3, patches.SIZE, patches.SIZE), np.float32), np.empty((n, 8, 8)),
+                       np.empty((n, patches.SIZE + 2, patches.LANES + 2), np.float32), np.empty((n, 6, 6)),
                        np.tile(np.eye(2), (n, 1, 1)))
 
 
@@ -74,7 +74,7 @@ class PointTracker:
         """Forget every track; ids go on counting."""
         self.corners = Corners.blank(0)
         self._image: U8 | None = None
-        self._pyramid: tuple[NDArray[np.float32], ...] = ()
+        self._pyramid: tuple[U8, ...] = ()
         self.x_turned: F64 = np.empty((0, 2))  # where the rotation alone would have put the corners of the newest image
         self.motion_x: F64 = np.empty((0, 2))  # and what is left
         self._past: deque[_Past] = deque(maxlen=LOOK_BACK)
@@ -95,8 +95,9 @@ class PointTracker:
             return
         before, corners = self.corners, self.corners.select(slice(None))
         corners.uv = self._predict(R_CnCp)
-        corners.shapes = self._turned_shapes(R_CnCp)
-        good = self._match(previous, before.uv, corners)
+        turns = self._turns(R_CnCp)
+        corners.shapes = turns @ before.shapes
+        good = self._match(previous, before.uv, turns, corners)
         corners.x = self._camera.normalise(corners.uv)
         corners.ages = before.ages + 1
         good &= self._inside(corners.uv) & np.isfinite(corners.x).all(axis=1)
@@ -126,28 +127,28 @@ class PointTracker:
         uv = self._camera.project(turn(R_CnCp, self.corners.x))
         return np.where(np.isfinite(uv).all(axis=1, keepdims=True), uv, self.corners.uv)
 
-    def _turned_shapes(self, R_CnCp: F64 | None) -> F64:
-        """Shapes (N, 2, 2) after the rotation: the derivative of turn(x), the lens taken as constant over the way."""
+    def _turns(self, R_CnCp: F64 | None) -> F64:
+        """Maps (N, 2, 2) of small surroundings by the rotation: the derivative of turn(x), the lens left out."""
         if R_CnCp is None:
-            return self.corners.shapes.copy()
+            return np.tile(np.eye(2), (len(self.corners), 1, 1))
         rays = self.corners.x @ R_CnCp[:, :2].T + R_CnCp[:, 2]
         moved = rays[:, :2, None] / rays[:, 2:, None]
-        return (R_CnCp[:2, :2] - moved * R_CnCp[2, :2]) / rays[:, 2:, None] @ self.corners.shapes
+        return (R_CnCp[:2, :2] - moved * R_CnCp[2, :2]) / rays[:, 2:, None]
 
-    def _match(self, previous: tuple[NDArray[np.float32], ...], start: F64, corners: Corners) -> NDArray[np.bool_]:
+    def _match(self, previous: tuple[U8, ...], start: F64, turns: F64, corners: Corners) -> NDArray[np.bool_]:
         """Improve the predictions corners.uv in place; mask (N,) of those that were found."""
-        n, newest = len(start), self._pyramid
+        n, newest, back_turns = len(start), self._pyramid, np.linalg.inv(turns)
         good, back_good = np.ones(n, np.bool_), np.ones(n, np.bool_)
-        patches.follow(previous, newest, start, corners.uv, 1, COARSE_STEPS, good)
+        patches.follow(previous, newest, start, back_turns, corners.uv, 1, COARSE_STEPS, good)
         uv, shapes, score = corners.uv.copy(), corners.shapes.copy(), np.empty(n)
         patches.align(newest[0], corners.templates, corners.inverses, uv, shapes, FINE_STEPS, score)
         area, stray = np.linalg.det(shapes), np.hypot(*(uv - corners.uv).T)
         same = (score > SAME_PATCH) & (stray < STRAY_PX) & (area > SHAPE[0]) & (area < SHAPE[1])
-        patches.follow(previous[:1], newest[:1], start, corners.uv, 0, COARSE_STEPS, changed := ~same)
+        patches.follow(previous[:1], newest[:1], start, back_turns, corners.uv, 0, COARSE_STEPS, changed := ~same)
         corners.uv[same], corners.shapes[same] = uv[same], shapes[same]
         good = same | changed
         back = start.copy()
-        patches.follow(newest[:1], previous[:1], corners.uv, back, 0, COARSE_STEPS, back_good)
+        patches.follow(newest[:1], previous[:1], corners.uv, turns, back, 0, COARSE_STEPS, back_good)
         good &= back_good & (np.hypot(*(back - start).T) < self._config.round_trip_px)
         relearn = good & ~same
         corners.shapes[relearn] = np.eye(2)
@@ -183,9 +184,9 @@ def turn(R_CnCp: F64 | None, x: F64) -> F64:
     return rays[..., :2] / np.where(rays[..., 2:] > 0.0, rays[..., 2:], np.nan)
 
 
-def pyramid(image: U8) -> tuple[NDArray[np.float32], ...]:
-    """Images as float32, each half the size of the one before."""
-    levels = [image.astype(np.float32)]
+def pyramid(image: U8) -> tuple[U8, ...]:
+    """Images, each half the size of the one before."""
+    levels = [image]
     for _ in range(LEVELS - 1):
         levels.append(cv2.pyrDown(levels[-1]))
     return tuple(levels)
