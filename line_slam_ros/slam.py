@@ -30,6 +30,7 @@ from line_slam_ros.types import (
 )
 from line_slam_ros.warm_up import warm_up_estimator, warm_up_front_end
 
+NEEDS_POINTS = 'corners, which every start needs: set use_points to true, or give poses (pose_source: topic)'
 MAX_IMU_GAP_S = 0.2  # longer, and the motion in between is anyone's guess
 
 
@@ -70,30 +71,39 @@ class Slam:
                 observations = self.front_end.track(frame, self._camera_rotation(samples))
             previous_ns, self._last_ns = self._last_ns, frame.t_ns
             still = self._stillness.add(observations, samples)
-            if self.status is Status.TRACKING and (gap := longest_gap(imu, previous_ns, frame.t_ns)) > MAX_IMU_GAP_S:
-                return self._lose(f'no inertial data for {gap:.2f} s')
+            if samples is not None and (gap := longest_gap(imu, previous_ns, frame.t_ns)) > MAX_IMU_GAP_S:
+                if self.status is Status.TRACKING:
+                    return self._lose(f'no inertial data for {gap:.2f} s')
+                samples = None  # a start begins after it
             if self.status is not Status.TRACKING or samples is None:
                 return self._initialise(observations, samples, still)
-            with self._timed('optimise'):
-                outliers = self.estimator.step(observations, samples, still)
-                self.front_end.forget(*outliers)
-                self._drop(outliers[1])
-            if self.estimator.failure:
-                return self._lose(self.estimator.failure)
-            estimate = self._estimate(samples)
-            if estimate.is_keyframe and self.config.use_lines:
-                with self._timed('map'):
-                    self._map()
-            with self._timed('marginalise'):
-                self.estimator.marginalise()
-            return estimate
+            try:
+                return self._follow(observations, samples, still)
+            except np.linalg.LinAlgError as error:
+                return self._lose(f'equations without a solution ({error})')
+
+    def _follow(self, observations: Observations, samples: Samples, still: bool) -> Estimate | None:
+        """One frame through the running estimator and the map."""
+        with self._timed('optimise'):
+            outliers = self.estimator.step(observations, samples, still)
+            self.front_end.forget(*outliers)
+            self._drop(outliers[1])
+        if self.estimator.failure:
+            return self._lose(self.estimator.failure)
+        estimate = self._estimate(samples)
+        if estimate.is_keyframe and self.config.use_lines:
+            with self._timed('map'):
+                self._map()
+        with self._timed('marginalise'):
+            self.estimator.marginalise()
+        return estimate
 
     def reset(self, reason: str) -> None:
         """Start anew: time, map and origin."""
         self.resets += 1
         self.status, self.waiting_for = Status.INITIALISING, reason
         self._forget()
-        self._bootstrap.anchor = np.zeros(3), 0.0
+        self._bootstrap.anchor = None
         self.line_map.clear()
         self._last_ns = None
 
@@ -108,7 +118,7 @@ class Slam:
     def _initialise(self, observations: Observations, samples: Samples | None, still: bool) -> Estimate | None:
         with self._timed('initialise'):
             started = self._bootstrap.add(observations, samples, self._stillness.mean_imu() if still else None)
-        self.waiting_for = self._bootstrap.waiting_for
+        self.waiting_for = self._bootstrap.waiting_for if self.config.use_points else NEEDS_POINTS
         if not started or samples is None:
             return None
         self.status, self.waiting_for = Status.TRACKING, ''

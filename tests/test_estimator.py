@@ -138,3 +138,20 @@ def test_simulated_inertial_data_is_the_derivative_of_the_trajectory():
     (_, p1, v1, *_), (_, p0, v0, *_) = trajectory.at(t + h), trajectory.at(t - h)
     np.testing.assert_allclose((p1 - p0) / (2 * h), v, atol=1e-6)
     np.testing.assert_allclose(np.einsum('nji,nj->ni', R, (v1 - v0) / (2 * h) - GRAVITY_W), force, atol=1e-5)
+
+
+def test_a_long_rest_costs_neither_memory_nor_certainty():
+    """Tracks live two seconds, so thousands of corners come and go; rows and samples stay bounded, nothing wanders."""
+    sequence = Sequence(Trajectory.random(8, rest=99.0), Room.random(8), calibration(), 30.0, frame_rate=10.0)
+
+    def renewed(k, seen):
+        epoch = (k + seen.points.ids) // 20
+        return replace(seen, points=replace(seen.points, ids=seen.points.ids + 1000 * epoch))
+
+    estimator, _, p, _, failures = run(sequence, change=renewed)
+    window = estimator.window
+    assert not any(failures)
+    assert max(len(s[0]) for s in window.samples) < 1300
+    assert window.points.count < len(window.points.ids)
+    assert np.linalg.norm(p - p[0], axis=1).max() < 0.005
+    assert np.linalg.norm(window.b[window.n - 1, 3:]) < 0.2

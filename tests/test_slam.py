@@ -134,3 +134,63 @@ def test_same_input_gives_the_same_numbers(sequence):
         return [e.T_WB for _, e, *_ in feed(slam, replace(sequence, seconds=4.0)) if e is not None]
 
     np.testing.assert_array_equal(poses(), poses())
+
+
+def test_a_start_after_time_jumped_far_back_does_not_wait_for_the_old_time(slam, sequence):
+    def later(t, observations, imu):
+        hour = 3_600_000_000_000
+        return replace(observations, t_ns=observations.t_ns + hour), replace(imu, t_ns=imu.t_ns + hour)
+
+    feed_later = [later(o.t_ns * 1e-9, o, i) for o, i in replace(sequence, seconds=2.0)]
+    for observations, imu in feed_later:
+        slam.front_end.next = observations
+        slam.process(Frame(observations.t_ns, BLACK), imu)
+    slam.reset('time jumped back')
+    out = feed(slam, sequence)
+    assert next(t for t, e, *_ in out if e is not None) <= 3.0
+
+
+def test_equations_without_a_solution_are_lost_and_started_again(slam, sequence, monkeypatch):
+    step, calls = slam.estimator.step, []
+
+    def once(*args):
+        calls.append(args)
+        if len(calls) == 20:
+            raise np.linalg.LinAlgError('singular')
+        return step(*args)
+
+    monkeypatch.setattr(slam.estimator, 'step', once)
+    out = feed(slam, sequence)
+    lost = [waits for *_, status, waits in out if status is Status.LOST]
+    assert lost and 'singular' in lost[0] and slam.resets == 1 and out[-1][2] is Status.TRACKING
+
+
+X_UP = np.array([[0, 0, 1.0], [0, 1.0, 0], [-1.0, 0, 0]])
+
+
+@pytest.mark.parametrize('mounting', [np.eye(3), X_UP], ids=['z up', 'x up'])
+def test_after_a_loss_position_and_heading_go_on(mounting):
+    T = np.eye(4)
+    T[:3, :3] = mounting
+    base = Sequence(Trajectory.random(7, rest=60.0), Room.random(7), calibration(), 8.0)
+    slam = Slam(Config(points=PointOptions(max_count=600)), replace(base.calibration, T_BC=T @ base.calibration.T_BC))
+    slam.front_end = Told()
+
+    def dark(t, observations, imu):
+        turned = ImuBatch(imu.t_ns, imu.gyro_B @ mounting.T, imu.accel_B @ mounting.T)
+        none = replace(observations.points, ids=np.empty(0, np.int64), uv=np.empty((0, 2)), x=np.empty((0, 2)))
+        lines = replace(observations.lines, ids=np.empty(0, np.int64), ends=np.empty((0, 2, 2)), sigma=np.empty((0, 2)))
+        return (replace(observations, points=none, lines=lines) if 2.0 < t < 5.5 else observations), turned
+
+    out = feed(slam, base, dark)
+    assert any(status is Status.LOST for *_, status, _ in out) and out[-1][2] is Status.TRACKING
+    before = next(e for t, e, *_ in reversed(out) if e is not None and t < 2.0)
+    after = out[-1][1]
+    np.testing.assert_allclose(after.T_WB[:3, :3], before.T_WB[:3, :3], atol=0.02)
+
+
+def test_without_points_it_says_that_a_start_needs_them(sequence):
+    slam = Slam(Config(use_points=False), calibration())
+    slam.front_end = Told()
+    out = feed(slam, replace(sequence, seconds=1.0))
+    assert all('use_points' in waits for *_, waits in out)

@@ -7,6 +7,7 @@ import numpy as np
 
 from line_slam_ros.estimation.estimator import Estimator
 from line_slam_ros.estimation.initialisation import Snapshot, Start, matches, merge_samples, start_in_motion, upright
+from line_slam_ros.estimation.stillness import SPAN_S
 from line_slam_ros.geometry.lie import so3_exp
 from line_slam_ros.types import F64, Calibration, Observations, Samples
 
@@ -25,11 +26,13 @@ class Bootstrap:
         self._options = estimator.options
         self._shots: list[Snapshot] = []
         self._next_try_ns = 0
-        self.anchor = (np.zeros(3), 0.0)  # position (m) and heading (rad) of the first state in W
+        self.anchor: tuple[F64, F64] | None = None  # position (3,) m of the first state in W, R_WB to take heading from
+        self._unbroken_ns = 0  # since when every frame shares corners with the one before
         self.waiting_for = 'first image'
 
     def clear(self) -> None:
         self._shots.clear()
+        self._next_try_ns = 0
 
     def add(self, observations: Observations, samples: Samples | None, still_imu: tuple[F64, F64] | None) -> bool:
         """Take a frame; True once the estimator's window is filled.
@@ -38,43 +41,47 @@ class Bootstrap:
         """
         if samples is None:
             self._shots.clear()
+        if not self._shots or len(matches(self._shots[-1].observations, observations)[0]) < MIN_MATCHES:
+            self._unbroken_ns = observations.t_ns
         self._shots.append(Snapshot(observations.t_ns, observations, samples))
         horizon = observations.t_ns - int(self._options.init_window_s * 1e9)
         while len(self._shots) > 2 and self._shots[1].t_ns <= horizon:
             del self._shots[0]
         if still_imu is not None:
-            return self._from_rest(*still_imu)
+            return self._from_rest(observations.t_ns, *still_imu)
         return self._from_motion(observations.t_ns)
 
-    def _from_rest(self, rate: F64, force: F64) -> bool:
+    def _from_rest(self, now_ns: int, rate: F64, force: F64) -> bool:
         strength = float(np.linalg.norm(force))
         if abs(strength - self._options.gravity) > 1.0:
             self.waiting_for = (f'gravity: the accelerometer reads {strength:.2f} m/s^2 at rest, '
                                 f'{self._options.gravity} expected (are its units m/s^2?)')
             return False
-        shots = self._spread(2)
+        shots = self._spread(2, now_ns - int(SPAN_S * 1e9))  # before that it may have moved
+        if len(shots) < 2:
+            return False
         R = np.repeat(upright(force)[None], len(shots), axis=0)
         zeros = np.zeros((len(shots), 3))
         self._begin(shots, Start(R, zeros, zeros, rate), still=True)
         return True
 
     def _from_motion(self, now_ns: int) -> bool:
-        span = (now_ns - self._shots[0].t_ns) * 1e-9
-        if span < 0.5 * self._options.init_window_s:
-            self.waiting_for = f'{0.5 * self._options.init_window_s:.1f} s of images with inertial data'
+        needed = 0.5 * self._options.init_window_s
+        if (now_ns - self._shots[0].t_ns) * 1e-9 < needed:
+            self.waiting_for = f'{needed:.1f} s of images with inertial data'
             return False
-        then, now = matches(self._shots[0].observations, self._shots[-1].observations)
-        shift = np.median(np.linalg.norm(now - then, axis=1)) * self._estimator.focal if len(then) else 0.0
-        if len(then) < MIN_MATCHES:
-            self.waiting_for = f'texture: {len(then)} corners tracked over {span:.1f} s, {MIN_MATCHES} needed'
-            return False
-        if shift < MIN_PARALLAX_PX:
-            self.waiting_for = f'motion: corners moved {shift:.0f} px in {span:.1f} s, {MIN_PARALLAX_PX:.0f} needed'
+        shots = self._spread(self._options.window - 1, self._unbroken_ns)
+        span = (now_ns - shots[0].t_ns) * 1e-9
+        if span < needed:
+            self.waiting_for = f'texture: {MIN_MATCHES} corners tracked from image to image over {needed:.1f} s'
             return False
         if now_ns < self._next_try_ns:
             return False
         self._next_try_ns = now_ns + 100_000_000
-        shots = self._spread(self._options.window - 1)
+        shift = self._shift(shots)
+        if shift < MIN_PARALLAX_PX:
+            self.waiting_for = f'motion: corners moved {shift:.0f} px in {span:.1f} s, {MIN_PARALLAX_PX:.0f} needed'
+            return False
         start = start_in_motion(shots, self._calibration.T_BC, self._calibration.imu_noise, self._options.gravity)
         if start is None:
             self.waiting_for = 'motion that makes velocity and gravity observable: turn and accelerate the camera'
@@ -83,9 +90,16 @@ class Bootstrap:
         self.waiting_for = self._refuse()
         return not self.waiting_for
 
-    def _spread(self, count: int) -> list[Snapshot]:
-        """At most count snapshots evenly over the buffer, newest included, samples merged in between."""
-        picked = np.unique(np.linspace(0, len(self._shots) - 1, count).round().astype(int))
+    def _shift(self, shots: list[Snapshot]) -> float:
+        """Median path of the corners over the snapshots, px, rotation included."""
+        steps = [np.linalg.norm(y - x, axis=1) for x, y in (matches(a.observations, b.observations)
+                                                            for a, b in pairwise(shots))]
+        return float(sum(np.median(s) for s in steps if len(s))) * self._estimator.focal
+
+    def _spread(self, count: int, since_ns: int) -> list[Snapshot]:
+        """At most count snapshots evenly over those since a time, newest included, samples merged in between."""
+        first = next(k for k, s in enumerate(self._shots) if s.t_ns >= since_ns)
+        picked = np.unique(np.linspace(first, len(self._shots) - 1, count).round().astype(int))
         chosen = [self._shots[picked[0]]]
         for a, b in pairwise(picked):
             parts = [s.samples for s in self._shots[a + 1:b + 1] if s.samples is not None]
@@ -93,7 +107,9 @@ class Bootstrap:
         return chosen
 
     def _begin(self, shots: list[Snapshot], start: Start, still: bool) -> None:
-        position, heading = self.anchor
+        position, R_WB = self.anchor or (np.zeros(3), start.R_WB[0])
+        turn = R_WB @ start.R_WB[0].T  # its part about the vertical that comes closest
+        heading = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
         R = so3_exp(np.array([0.0, 0.0, heading]))
         placed = Start(R @ start.R_WB, start.p_W @ R.T + position, start.v_W @ R.T, start.gyro_bias)
         self._estimator.begin(placed, shots, still)

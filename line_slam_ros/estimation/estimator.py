@@ -47,7 +47,10 @@ class Estimator:
 
     def __init__(self, options: Options, calibration: Calibration, focal_px: float, max_points: int, max_lines: int):
         self.options, self.focal = options, focal_px
-        self.window = Window(options.window + 1, calibration.imu_noise, 4 * max_points + 64, 4 * max_lines + 64)
+        # two views of every row that the newest state does not see, so half the tracks of a state; the newest's and
+        # the last one's may be new
+        rows = (options.window + 4) / 2
+        self.window = Window(options.window + 1, calibration.imu_noise, int(rows * max_points), int(rows * max_lines))
         self.g_W = np.array([0.0, 0.0, -options.gravity])
         self.R_BC, self.p_BC = calibration.T_BC[:3, :3].copy(), calibration.T_BC[:3, 3].copy()
         self.solver = Solver(self.window, SolverOptions(self.R_BC, self.p_BC, self.g_W, options.loss_scale**2,
@@ -68,6 +71,7 @@ class Estimator:
             w.append(shot.t_ns, start.R_WB[k], start.p_W[k], start.v_W[k], bias, shot.samples)
             w.still[k] = still
             self._register(k, shot.observations)
+            self._forget_ended()
         o = self.options
         sigma = np.concatenate([[0.3, 0.3, 1e-4], np.full(3, 1e-4), np.full(3, 10.0),
                                 np.full(3, o.gyro_bias_sigma), np.full(3, o.accel_bias_sigma)])
@@ -105,13 +109,13 @@ class Estimator:
         """(9, 9) of the newest state's [rotation in B, position in W, velocity in W], as of the last linearisation."""
         return self.solver.covariance(self.window.n - 1)[:9, :9]
 
-    def last_good(self) -> tuple[F64, float]:
-        """Position (3,) and heading of the newest finite state, the origin when there is none."""
+    def last_good(self) -> tuple[F64, F64] | None:
+        """Position (3,) and rotation R_WB (3, 3) of the newest finite state, None when there is none."""
         w = self.window
         for k in range(w.n - 1, -1, -1):
             if np.isfinite(w.p[k]).all() and np.linalg.norm(w.v[k]) < MAX_SPEED:
-                return w.p[k].copy(), float(np.arctan2(w.R[k, 1, 0], w.R[k, 0, 0]))
-        return np.zeros(3), 0.0
+                return w.p[k].copy(), w.R[k].copy()
+        return None
 
     def points(self) -> F64:
         """Solved points (N, 3) in W."""
@@ -140,8 +144,9 @@ class Estimator:
         newest = self._predict(observations.t_ns, samples)
         w.still[newest] = still
         self._register(newest, observations)
-        if not self.newest_is_keyframe and (still or not w.still[newest - 1]):
+        if not self.newest_is_keyframe and not self._borders_rest(newest - 1):
             drop_state(self.solver, newest - 1)
+        self._forget_ended()
         self._triangulate()
         if not self._marginalised:
             w.recentre_prior()
@@ -150,6 +155,11 @@ class Estimator:
         self.newest_is_keyframe = self._is_keyframe()
         self.failure = self._health()
         return outliers
+
+    def _borders_rest(self, slot: int) -> bool:
+        """Whether a state is the first or last of a rest: those stay, and the links in between hold rest alone."""
+        still = self.window.still
+        return bool(still[slot] and not (still[slot - 1] and still[slot + 1]))
 
     def marginalise(self) -> None:
         """Make room for the next frame once the window is full."""
@@ -160,7 +170,7 @@ class Estimator:
         p, q, newest = w.points, w.lines, w.n - 1
         q.views[:q.count] += q.seen[:q.count, 0]
         marginalise_oldest(self.solver, self._leaving(p, newest), self._leaving(q, newest))
-        self._forget_unseen()
+        self._forget_ended()
 
     @staticmethod
     def _leaving(table, newest: int) -> np.ndarray:
@@ -207,10 +217,12 @@ class Estimator:
             table.keep(~dead)
         return gone[0], gone[1]
 
-    def _forget_unseen(self) -> None:
-        """Rows that no slot sees any more."""
+    def _forget_ended(self) -> None:
+        """Rows that the newest state does not see and fewer than two others do: they say nothing, and never will."""
+        n = self.window.n
         for table in (self.window.points, self.window.lines):
-            table.keep(table.seen[:table.count, :self.window.n].any(axis=1))
+            seen = table.seen[:table.count, :n]
+            table.keep(seen[:, n - 1] | (seen.sum(axis=1) >= 2))
 
     def _is_keyframe(self) -> bool:
         """By mean parallax (rotation removed) against the previous keyframe, share of shared tracks, and time."""

@@ -11,6 +11,8 @@ from line_slam_ros.geometry.imu import preintegrate
 from line_slam_ros.geometry.lie_kernels import log_so3, multiply_transposed
 from line_slam_ros.types import F64, I64, ImuNoise, Samples
 
+REST_S = 2.0  # longer at rest, the accelerometer only ties tilt and bias ever tighter: too stiff to solve, nothing new
+REST_SAMPLES = 1000  # inertial samples of a link between states at rest beyond which they are averaged
 STATE = 15  # [rotation, position, velocity, gyro bias, accelerometer bias]
 
 
@@ -27,6 +29,14 @@ def state_difference(n, R, p, v, b, R0, p0, v0, b0, delta):
             delta[o + 6 + i] = v[k, i] - v0[k, i]
         for i in range(6):
             delta[o + 9 + i] = b[k, i] - b0[k, i]
+
+
+def averaged(samples: Samples) -> Samples:
+    """The same time and means in eleven samples: all that matters of a link at rest."""
+    t, gyro, accel = samples
+    share = np.diff(t)[:, None] / t[-1]
+    means = (np.tile((share * 0.5 * (a[1:] + a[:-1])).sum(axis=0), (11, 1)) for a in (gyro, accel))
+    return np.linspace(0.0, t[-1], 11), *means
 
 
 class LandmarkTable:
@@ -130,6 +140,8 @@ class Window:
                                      self.noise.gyro_density**2, self.noise.accel_density**2, self.dR[link],
                                      self.dp[link], self.dv[link], self.J_b[link], self.cov[link])
         self.W[link] = np.linalg.inv(np.linalg.cholesky(self.cov[link] + 1e-14 * np.eye(9)))
+        if self.dt[link] > REST_S and self.still[link] and self.still[link + 1]:
+            self.W[link, 3:] = 0.0  # of lower triangular W, what is left whitens the rotation alone
         self.w_b[link] = 1.0 / (np.repeat([self.noise.gyro_walk, self.noise.accel_walk], 3) * np.sqrt(self.dt[link]))
 
     def freeze(self, slots: np.ndarray) -> None:
@@ -161,6 +173,8 @@ class Window:
         if 0 < slot < n - 1:
             (t1, g1, a1), (t2, g2, a2) = self.samples[slot - 1:slot + 1]
             merged = np.concatenate([t1, t1[-1] + t2[1:]]), np.concatenate([g1, g2[1:]]), np.concatenate([a1, a2[1:]])
+            if len(merged[0]) > REST_SAMPLES and self.still[slot - 1:slot + 2].all():
+                merged = averaged(merged)
             self.samples[slot - 1:slot + 1] = [merged]
         elif self.samples:
             del self.samples[0 if slot == 0 else -1]
