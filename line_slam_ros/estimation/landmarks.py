@@ -1,6 +1,6 @@
 """Points and lines in the normal equations, compiled: linearise, eliminate by Schur complement, step back, cost.
 
-A landmark's block E (slots, 6, d) holds its Hessian with the poses, A (d, d) its own (inverted once
+A landmark's block E (slots, d, 6) holds its Hessian with the poses, A (d, d) its own (inverted once
 eliminated), a (d,) its gradient; d is 3 for points, 4 for lines. Everything is written into the
 caller's buffers.
 """
@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 
 from line_slam_ros.estimation.window import STATE
-from line_slam_ros.factors.line_reprojection import line_reprojection, world_line
-from line_slam_ros.factors.point_reprojection import inverse_depth_point, point_reprojection
+from line_slam_ros.factors.line_reprojection import line_reprojection, line_residual, world_line
+from line_slam_ros.factors.point_reprojection import inverse_depth_point, point_reprojection, point_residual
 from line_slam_ros.geometry.lie_kernels import retract_rotation
 
 BEHIND = 100.0  # cost of a point behind its camera, squared standard deviations (a rejected step, not a gradient)
@@ -75,7 +75,7 @@ def _add_observation(slot, d, r, J_pose, J_land, H, g, E, A, a):
             H[o + i, o + j] += J_pose[0, i] * J_pose[0, j] + J_pose[1, i] * J_pose[1, j]
         g[o + i] += J_pose[0, i] * r[0] + J_pose[1, i] * r[1]
         for j in range(d):
-            E[slot, i, j] = J_pose[0, i] * J_land[0, j] + J_pose[1, i] * J_land[1, j]
+            E[slot, j, i] = J_pose[0, i] * J_land[0, j] + J_pose[1, i] * J_land[1, j]
     for i in range(d):
         for j in range(d):
             A[i, j] += J_land[0, i] * J_land[0, j] + J_land[1, i] * J_land[1, j]
@@ -84,8 +84,8 @@ def _add_observation(slot, d, r, J_pose, J_land, H, g, E, A, a):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def _eliminate(n, seen, d, damping, H, g, E, A, a, Y, L):
-    """Schur complement of one landmark: A becomes its inverse; H -= E A^-1 E' (on and above the
-    block diagonal only, see mirror), g -= E A^-1 a. False when A is singular."""
+    """Schur complement of one landmark: A becomes its inverse; H -= E' A^-1 E (on and above the
+    block diagonal only, see mirror), g -= E' A^-1 a. False when A is singular."""
     for i in range(d):
         A[i, i] *= 1.0 + damping
     if not _invert_spd(A, d, L):
@@ -97,18 +97,18 @@ def _eliminate(n, seen, d, damping, H, g, E, A, a, Y, L):
                 for j in range(d):
                     y = 0.0
                     for m in range(d):
-                        y += E[f, i, m] * A[m, j]
+                        y += E[f, m, i] * A[m, j]
                     Y[i, j] = y
                     s += y * a[j]
                 g[STATE * f + i] -= s
             for h in range(f, n):
                 if seen[h]:
                     for i in range(6):
-                        for j in range(6):
-                            s = 0.0
-                            for m in range(d):
-                                s += Y[i, m] * E[h, j, m]
-                            H[STATE * f + i, STATE * h + j] -= s
+                        row = H[STATE * f + i]
+                        for m in range(d):
+                            y = Y[i, m]
+                            for j in range(6):
+                                row[STATE * h + j] -= y * E[h, m, j]
     return True
 
 
@@ -128,7 +128,7 @@ def add_points(n, R, p, R0, p0, R_BC, p_BC, use, seen, z, sigma, abr, R_WA, p_WA
     """Linearise and eliminate the points of rows with use[i]; residuals at (R, p), Jacobians at the first estimates.
 
     A weak prior of weight w_rho (m) pulls the inverse depth of unobservable points to rho0 (1/m).
-    Fills E (M, n, 6, 3), A (M, 3, 3) (inverses) and a (M, 3) for the back substitution.
+    Fills E (M, n, 3, 6), A (M, 3, 3) (inverses) and a (M, 3) for the back substitution.
     """
     r, q, J_pose, J_ext, J_p = np.empty(2), np.empty(2), np.empty((2, 6)), np.empty((2, 6)), np.empty((2, 3))
     p_W, C, J, Y, L = np.empty(3), np.empty((3, 3)), np.empty((2, 3)), np.empty((6, 3)), np.empty((3, 3))
@@ -142,7 +142,7 @@ def add_points(n, R, p, R0, p0, R_BC, p_BC, use, seen, z, sigma, abr, R_WA, p_WA
             E[i, f] = 0.0
             if not seen[i, f]:
                 continue
-            if not point_reprojection(R[f], p[f], R_BC, p_BC, p_W, z[i, f], r, J_pose, J_ext, J_p):
+            if not point_residual(R[f], p[f], R_BC, p_BC, p_W, z[i, f], r):
                 continue
             if not point_reprojection(R0[f], p0[f], R_BC, p_BC, p_W, z[i, f], q, J_pose, J_ext, J_p):
                 continue
@@ -159,7 +159,7 @@ def add_points(n, R, p, R0, p0, R_BC, p_BC, use, seen, z, sigma, abr, R_WA, p_WA
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def add_lines(n, R, p, R0, p0, R_BC, p_BC, use, seen, z, sigma, host, U, phi, rho, origin, c2, damping, H, g, E, A, a):
-    """As add_points, for lines in either form (see world_line): E (M, n, 6, 4), A (M, 4, 4), a (M, 4)."""
+    """As add_points, for lines in either form (see world_line): E (M, n, 4, 6), A (M, 4, 4), a (M, 4)."""
     r, q, J_pose, J_ext, J_l = np.empty(2), np.empty(2), np.empty((2, 6)), np.empty((2, 6)), np.empty((2, 6))
     n_W, d_W, C = np.empty(3), np.empty(3), np.empty((6, 4))
     J, Y, L, scale = np.empty((2, 4)), np.empty((6, 4)), np.empty((4, 4)), np.empty(2)
@@ -172,7 +172,7 @@ def add_lines(n, R, p, R0, p0, R_BC, p_BC, use, seen, z, sigma, host, U, phi, rh
             E[i, f] = 0.0
             if not seen[i, f]:
                 continue
-            if not line_reprojection(R[f], p[f], R_BC, p_BC, n_W, d_W, z[i, f], r, J_pose, J_ext, J_l):
+            if not line_residual(R[f], p[f], R_BC, p_BC, n_W, d_W, z[i, f], r):
                 continue
             if not line_reprojection(R0[f], p0[f], R_BC, p_BC, n_W, d_W, z[i, f], q, J_pose, J_ext, J_l):
                 continue
@@ -191,7 +191,7 @@ def add_lines(n, R, p, R0, p0, R_BC, p_BC, use, seen, z, sigma, host, U, phi, rh
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def back_substitute(n, use, seen, d, E, A, a, dx, step):
-    """Landmark steps (M, d) = -A^-1 (a + E' dx) of the states' step dx."""
+    """Landmark steps (M, d) = -A^-1 (a + E dx) of the states' step dx."""
     for i in range(len(use)):
         for j in range(d):
             step[i, j] = 0.0
@@ -202,7 +202,7 @@ def back_substitute(n, use, seen, d, E, A, a, dx, step):
             for f in range(n):
                 if seen[i, f]:
                     for m in range(6):
-                        s += E[i, f, m, j] * dx[STATE * f + m]
+                        s += E[i, f, j, m] * dx[STATE * f + m]
             for k in range(d):
                 step[i, k] -= A[i, k, j] * s
 
@@ -210,8 +210,7 @@ def back_substitute(n, use, seen, d, E, A, a, dx, step):
 @njit(cache=True, nogil=True, error_model='numpy')
 def point_cost(n, R, p, R_BC, p_BC, use, seen, z, sigma, abr, R_WA, p_WA, c2, rho0, w_rho, chi2):
     """Robust cost of the points; fills chi2 (M, n) with squared whitened residuals (-1 where unseen or behind)."""
-    r, J_pose, J_ext, J_p = np.empty(2), np.empty((2, 6)), np.empty((2, 6)), np.empty((2, 3))
-    p_W, C = np.empty(3), np.empty((3, 3))
+    r, p_W, C = np.empty(2), np.empty(3), np.empty((3, 3))
     cost = 0.0
     for i in range(len(use)):
         if not use[i]:
@@ -222,7 +221,7 @@ def point_cost(n, R, p, R_BC, p_BC, use, seen, z, sigma, abr, R_WA, p_WA, c2, rh
             chi2[i, f] = -1.0
             if not seen[i, f]:
                 continue
-            if not point_reprojection(R[f], p[f], R_BC, p_BC, p_W, z[i, f], r, J_pose, J_ext, J_p):
+            if not point_residual(R[f], p[f], R_BC, p_BC, p_W, z[i, f], r):
                 cost += BEHIND
                 chi2[i, f] = BEHIND
                 continue
@@ -234,8 +233,7 @@ def point_cost(n, R, p, R_BC, p_BC, use, seen, z, sigma, abr, R_WA, p_WA, c2, rh
 @njit(cache=True, nogil=True, error_model='numpy')
 def line_cost(n, R, p, R_BC, p_BC, use, seen, z, sigma, host, U, phi, rho, origin, c2, chi2):
     """Robust cost of the lines; chi2 (M, n) as in point_cost."""
-    r, J_pose, J_ext, J_l = np.empty(2), np.empty((2, 6)), np.empty((2, 6)), np.empty((2, 6))
-    n_W, d_W, C = np.empty(3), np.empty(3), np.empty((6, 4))
+    r, n_W, d_W, C = np.empty(2), np.empty(3), np.empty(3), np.empty((6, 4))
     cost = 0.0
     for i in range(len(use)):
         if not use[i]:
@@ -243,7 +241,7 @@ def line_cost(n, R, p, R_BC, p_BC, use, seen, z, sigma, host, U, phi, rho, origi
         world_line(host, U[i], phi[i], rho[i], origin[i], n_W, d_W, C)
         for f in range(n):
             chi2[i, f] = -1.0
-            if seen[i, f] and line_reprojection(R[f], p[f], R_BC, p_BC, n_W, d_W, z[i, f], r, J_pose, J_ext, J_l):
+            if seen[i, f] and line_residual(R[f], p[f], R_BC, p_BC, n_W, d_W, z[i, f], r):
                 chi2[i, f] = (r[0] / sigma[i, f, 0]) ** 2 + (r[1] / sigma[i, f, 1]) ** 2
                 cost += cauchy(chi2[i, f], c2)[0]
     return 0.5 * cost

@@ -24,7 +24,7 @@ from line_slam_ros.factors.imu_factor import imu_jacobians, imu_residual
 from line_slam_ros.geometry.lie_kernels import retract_rotation
 from line_slam_ros.types import F64
 
-CONVERGED = 1.0  # decrease of the cost (half squared standard deviations) below which iterating ends
+CONVERGED = 1.0  # change of the cost (half squared standard deviations) below which iterating ends
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -103,7 +103,7 @@ class Solver:
         self.window, self.options = window, options
         dim, rows_p, rows_l, slots = STATE * window.slots, len(window.points.ids), len(window.lines.ids), window.slots
         self.H, self.g, self._delta = np.zeros((dim, dim)), np.zeros(dim), np.zeros(dim)
-        self._E_p, self._E_l = np.zeros((rows_p, slots, 6, 3)), np.zeros((rows_l, slots, 6, 4))
+        self._E_p, self._E_l = np.zeros((rows_p, slots, 3, 6)), np.zeros((rows_l, slots, 4, 6))
         self._A_p, self._A_l = np.zeros((rows_p, 3, 3)), np.zeros((rows_l, 4, 4))
         self._a_p, self._a_l = np.zeros((rows_p, 3)), np.zeros((rows_l, 4))
         self._step_p, self._step_l = np.zeros((rows_p, 3)), np.zeros((rows_l, 4))
@@ -190,14 +190,14 @@ class Solver:
                 self._damping = min(max(10.0 * self._damping, 1e-4), 1e4)
                 continue
             new_cost = self.cost()
-            if new_cost < cost:
-                self._damping = max(0.1 * self._damping, 1e-9)
-                done, cost = cost - new_cost < CONVERGED, new_cost
-                if done:
-                    return cost
+            gain = cost - new_cost
+            if gain > 0.0:
+                self._damping, cost = max(0.1 * self._damping, 1e-9), new_cost
             else:
                 self._restore(before)
                 self._damping = min(max(10.0 * self._damping, 1e-4), 1e4)
+            if abs(gain) < CONVERGED:
+                break
         return self.cost()
 
     def _step(self, use_p, use_l) -> bool:

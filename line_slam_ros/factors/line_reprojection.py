@@ -6,20 +6,12 @@ document with (15) corrected; see docs/line-geometry.md.
 import numpy as np
 from numba import njit
 
+NO_IMAGE = 1e-18  # |n_C[:2]|^2 / |d|^2 at and below which a line runs through the optical centre along the axis
+
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def line_reprojection(R_WB, p_WB, R_BC, p_BC, n_W, d_W, ends, r, J_pose, J_ext, J_line):
-    """Signed distances of the observed ends to the projected 3D line, normalised coordinates.
-
-        (n, d)_B = (R_WB' (n_W - p_WB x d_W), R_WB' d_W),  n_C = R_BC' (n_B - p_BC x d_B)
-        r_k = n_C . x_k / |n_C[:2]|                     x_k = (u, v, 1), the k-th end
-        dn_C: body rotation R_BC' ([n_B]x - [p_BC]x [d_B]x), body position R_WC' [d_W]x,
-              extrinsic [[n_C]x, R_BC' [d_B]x], line [R_WC', -R_WC' [p_WC]x]
-
-    ends (2, 2) -> fills r (2,), J_pose (2, 6), J_ext (2, 6) ([rotation, position]) and
-    J_line (2, 6) with respect to (n_W, d_W). Returns False, filling nothing, when the line passes
-    the optical centre along the axis and has no image (|n_C[:2]| below 1e-9 |d|).
-    """
+def _in_body_and_camera(R_WB, p_WB, R_BC, p_BC, n_W, d_W):
+    """(n_B, d_B, n_C) as nine numbers."""
     m0 = n_W[0] - (p_WB[1] * d_W[2] - p_WB[2] * d_W[1])
     m1 = n_W[1] - (p_WB[2] * d_W[0] - p_WB[0] * d_W[2])
     m2 = n_W[2] - (p_WB[0] * d_W[1] - p_WB[1] * d_W[0])
@@ -35,8 +27,38 @@ def line_reprojection(R_WB, p_WB, R_BC, p_BC, n_W, d_W, ends, r, J_pose, J_ext, 
     nc0 = R_BC[0, 0] * h0 + R_BC[1, 0] * h1 + R_BC[2, 0] * h2
     nc1 = R_BC[0, 1] * h0 + R_BC[1, 1] * h1 + R_BC[2, 1] * h2
     nc2 = R_BC[0, 2] * h0 + R_BC[1, 2] * h1 + R_BC[2, 2] * h2
+    return nb0, nb1, nb2, db0, db1, db2, nc0, nc1, nc2
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def line_residual(R_WB, p_WB, R_BC, p_BC, n_W, d_W, ends, r):
+    """line_reprojection without its Jacobians."""
+    _, _, _, db0, db1, db2, nc0, nc1, nc2 = _in_body_and_camera(R_WB, p_WB, R_BC, p_BC, n_W, d_W)
     rho2 = nc0 * nc0 + nc1 * nc1
-    if not rho2 > 1e-18 * (d_W[0] * d_W[0] + d_W[1] * d_W[1] + d_W[2] * d_W[2]):
+    if not rho2 > NO_IMAGE * (db0 * db0 + db1 * db1 + db2 * db2):
+        return False
+    inv = 1.0 / np.sqrt(rho2)
+    for k in range(2):
+        r[k] = (nc0 * ends[k, 0] + nc1 * ends[k, 1] + nc2) * inv
+    return True
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def line_reprojection(R_WB, p_WB, R_BC, p_BC, n_W, d_W, ends, r, J_pose, J_ext, J_line):
+    """Signed distances of the observed ends to the projected 3D line, normalised coordinates.
+
+        (n, d)_B = (R_WB' (n_W - p_WB x d_W), R_WB' d_W),  n_C = R_BC' (n_B - p_BC x d_B)
+        r_k = n_C . x_k / |n_C[:2]|                     x_k = (u, v, 1), the k-th end
+        dn_C: body rotation R_BC' ([n_B]x - [p_BC]x [d_B]x), body position R_WC' [d_W]x,
+              extrinsic [[n_C]x, R_BC' [d_B]x], line [R_WC', -R_WC' [p_WC]x]
+
+    ends (2, 2) -> fills r (2,), J_pose (2, 6), J_ext (2, 6) ([rotation, position]) and
+    J_line (2, 6) with respect to (n_W, d_W). Returns False, filling nothing, when the line passes
+    the optical centre along the axis and has no image (|n_C[:2]| below 1e-9 |d|).
+    """
+    nb0, nb1, nb2, db0, db1, db2, nc0, nc1, nc2 = _in_body_and_camera(R_WB, p_WB, R_BC, p_BC, n_W, d_W)
+    rho2 = nc0 * nc0 + nc1 * nc1
+    if not rho2 > NO_IMAGE * (db0 * db0 + db1 * db1 + db2 * db2):
         return False
     inv = 1.0 / np.sqrt(rho2)
     for k in range(2):

@@ -1,6 +1,31 @@
 """A corner's reprojection residual and its Jacobians, compiled and allocation free."""
 from numba import njit
 
+MIN_DEPTH = 1e-3  # m: nearer, or behind, a point has no image
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _in_body_and_camera(R_WB, p_WB, R_BC, p_BC, p_W):
+    """(p_B, p_C) as six numbers."""
+    d0, d1, d2 = p_W[0] - p_WB[0], p_W[1] - p_WB[1], p_W[2] - p_WB[2]
+    b0 = R_WB[0, 0] * d0 + R_WB[1, 0] * d1 + R_WB[2, 0] * d2
+    b1 = R_WB[0, 1] * d0 + R_WB[1, 1] * d1 + R_WB[2, 1] * d2
+    b2 = R_WB[0, 2] * d0 + R_WB[1, 2] * d1 + R_WB[2, 2] * d2
+    e0, e1, e2 = b0 - p_BC[0], b1 - p_BC[1], b2 - p_BC[2]
+    c0 = R_BC[0, 0] * e0 + R_BC[1, 0] * e1 + R_BC[2, 0] * e2
+    c1 = R_BC[0, 1] * e0 + R_BC[1, 1] * e1 + R_BC[2, 1] * e2
+    c2 = R_BC[0, 2] * e0 + R_BC[1, 2] * e1 + R_BC[2, 2] * e2
+    return b0, b1, b2, c0, c1, c2
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def point_residual(R_WB, p_WB, R_BC, p_BC, p_W, x, r):
+    """point_reprojection without its Jacobians."""
+    _, _, _, c0, c1, c2 = _in_body_and_camera(R_WB, p_WB, R_BC, p_BC, p_W)
+    if not c2 > MIN_DEPTH:
+        return False
+    r[0], r[1] = c0 / c2 - x[0], c1 / c2 - x[1]
+    return True
+
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def point_reprojection(R_WB, p_WB, R_BC, p_BC, p_W, x, r, J_pose, J_ext, J_point):
@@ -11,17 +36,10 @@ def point_reprojection(R_WB, p_WB, R_BC, p_BC, p_W, x, r, J_pose, J_ext, J_point
         body pose [A [p_B]x, -A R_WB'],  extrinsic [D [p_C]x, -A],  point A R_WB'
 
     x (2,) -> fills r (2,), J_pose (2, 6), J_ext (2, 6) (both [rotation, position]), J_point (2, 3).
-    Returns False, filling nothing, for a point that is not in front of the camera (z <= 1e-3).
+    Returns False, filling nothing, for a point that is not in front of the camera (z <= MIN_DEPTH).
     """
-    d0, d1, d2 = p_W[0] - p_WB[0], p_W[1] - p_WB[1], p_W[2] - p_WB[2]
-    b0 = R_WB[0, 0] * d0 + R_WB[1, 0] * d1 + R_WB[2, 0] * d2
-    b1 = R_WB[0, 1] * d0 + R_WB[1, 1] * d1 + R_WB[2, 1] * d2
-    b2 = R_WB[0, 2] * d0 + R_WB[1, 2] * d1 + R_WB[2, 2] * d2
-    e0, e1, e2 = b0 - p_BC[0], b1 - p_BC[1], b2 - p_BC[2]
-    c0 = R_BC[0, 0] * e0 + R_BC[1, 0] * e1 + R_BC[2, 0] * e2
-    c1 = R_BC[0, 1] * e0 + R_BC[1, 1] * e1 + R_BC[2, 1] * e2
-    c2 = R_BC[0, 2] * e0 + R_BC[1, 2] * e1 + R_BC[2, 2] * e2
-    if not c2 > 1e-3:
+    b0, b1, b2, c0, c1, c2 = _in_body_and_camera(R_WB, p_WB, R_BC, p_BC, p_W)
+    if not c2 > MIN_DEPTH:
         return False
     iz = 1.0 / c2
     u, v = c0 * iz, c1 * iz
