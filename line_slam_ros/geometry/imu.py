@@ -46,29 +46,7 @@ def preintegrate(t, gyro, accel, bg, ba, var_g, var_a, dR, dp, dv, J, cov):
             A[i, 1] = -(M[i, 2] * a0 - M[i, 0] * a2)
             A[i, 2] = -(M[i, 0] * a1 - M[i, 1] * a0)
         _transition(W, H, Jr, A, M, dt, F, G)
-        for i in range(9):
-            for j in range(9):
-                s = 0.0
-                for m in range(9):
-                    s += F[i, m] * cov[m, j]
-                FC[i, j] = s
-        for i in range(9):
-            for j in range(i, 9):
-                s = 0.0
-                for m in range(9):
-                    s += FC[i, m] * F[j, m]
-                for m in range(3):
-                    s += (G[i, m] * G[j, m] * var_g + G[i, 3 + m] * G[j, 3 + m] * var_a) / dt
-                cov[i, j] = s
-                cov[j, i] = s
-        for j in range(6):
-            for i in range(9):
-                s = -G[i, j]
-                for m in range(9):
-                    s += F[i, m] * J[m, j]
-                FC[i, j] = s
-            for i in range(9):
-                J[i, j] = FC[i, j]
+        _propagate(F, G, var_g / dt, var_a / dt, cov, J, FC)
         for i in range(3):
             acc = M[i, 0] * a0 + M[i, 1] * a1 + M[i, 2] * a2
             dp[i] += dv[i] * dt + 0.5 * acc * dt * dt
@@ -93,6 +71,34 @@ def _transition(W, H, Jr, A, M, dt, F, G):
             G[3 + i, 3 + j] = 0.5 * dt * dt * M[i, j]
             G[6 + i, 3 + j] = dt * M[i, j]
         F[3 + i, 6 + i] = dt
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _propagate(F, G, var_g, var_a, cov, J, FC):
+    """cov <- F cov F' + G diag(var_g, var_a) G' and J <- F J - G, in place; FC (9, 9) is scratch."""
+    for i in range(9):
+        for j in range(9):
+            s = 0.0
+            for m in range(9):
+                s += F[i, m] * cov[m, j]
+            FC[i, j] = s
+    for i in range(9):
+        for j in range(i, 9):
+            s = 0.0
+            for m in range(9):
+                s += FC[i, m] * F[j, m]
+            for m in range(3):
+                s += G[i, m] * G[j, m] * var_g + G[i, 3 + m] * G[j, 3 + m] * var_a
+            cov[i, j] = s
+            cov[j, i] = s
+    for j in range(6):
+        for i in range(9):
+            s = -G[i, j]
+            for m in range(9):
+                s += F[i, m] * J[m, j]
+            FC[i, j] = s
+        for i in range(9):
+            J[i, j] = FC[i, j]
 
 
 def between(imu: ImuBatch, start_ns: int, end_ns: int) -> tuple[F64, F64, F64]:
