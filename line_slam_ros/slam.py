@@ -53,7 +53,7 @@ class Slam:
         self._mapped = np.empty(0, np.int64)
 
     def warm_up(self) -> None:
-        """Compile every kernel, or load it from the cache, on throwaway copies fed with a simulated second."""
+        """Compile every kernel, or load it from the cache, on throwaway copies fed with simulated data."""
         warm_up_front_end(FrontEnd(self.camera, self.config), self.calibration)
         warm_up_estimator(self.config.estimator)
         LineMap.warm_up(self.config.mapping)

@@ -4,8 +4,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from line_slam_ros.factors.line_reprojection import line_reprojection, orthonormal_line
-from line_slam_ros.factors.point_reprojection import inverse_depth_point, point_reprojection
+from line_slam_ros.factors.line_reprojection import line_reprojection, line_residual, orthonormal_line
+from line_slam_ros.factors.point_reprojection import inverse_depth_point, point_reprojection, point_residual
 from line_slam_ros.geometry import host_line, lines, orthonormal
 from line_slam_ros.geometry.lie import pose_plus, rigid, rigid_inverse, so3_exp, transform_points
 
@@ -305,3 +305,22 @@ def test_inverse_depth_point_and_its_jacobian(rho):
     p_A = np.array([[0.2, -0.3, 1.0]]) / rho
     np.testing.assert_allclose(p_W, transform_points(T_WA, p_A)[0], rtol=1e-12, atol=1e-12)
     check(J, numeric(lambda d: moved(d)[0], 3, 1e-3 * abs(rho)), rtol=1e-5)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_residuals_alone_are_those_that_come_with_jacobians(seed):
+    rng = np.random.default_rng(seed)
+    T_WB, T_BC, r = random_pose(rng), random_pose(rng), np.full(2, np.nan)
+    p_W, x = (T_WB @ T_BC @ [0.3, -0.2, 4.0, 1.0])[:3], rng.normal(size=2)
+    assert point_residual(*parts(T_WB), *parts(T_BC), p_W, x, r)
+    np.testing.assert_allclose(r, point(T_WB, T_BC, p_W, x).r, rtol=1e-12)
+    L_W, ends = rng.normal(size=6), rng.normal(size=(2, 2))
+    assert line_residual(*parts(T_WB), *parts(T_BC), L_W[:3].copy(), L_W[3:].copy(), ends, r)
+    np.testing.assert_allclose(r, line(T_WB, T_BC, L_W, ends).r, rtol=1e-12)
+
+
+def test_residuals_alone_refuse_what_has_no_image():
+    here, r = parts(np.eye(4)), np.full(2, np.nan)
+    assert not point_residual(*here, *here, np.array([0.1, 0.2, -1.0]), np.zeros(2), r)
+    assert not line_residual(*here, *here, np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), np.zeros((2, 2)), r)
+    assert np.isnan(r).all()

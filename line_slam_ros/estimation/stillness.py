@@ -35,21 +35,25 @@ class Stillness:
         first = self._past[0][0]
         if observations.t_ns - first.t_ns < SPAN_S * 1e9:
             return False
-        if self._moved(first, observations) or (self._rest and self._moved(self._rest, observations)):
-            self._rest = None
-            return False
-        gyro, accel = (np.concatenate([s[i] for _, s in list(self._past)[1:] if s is not None]) for i in (1, 2))
-        if gyro.std(axis=0).max() > MAX_GYRO_STD or accel.std(axis=0).max() > MAX_ACCEL_STD:
-            self._rest = None
-            return False
-        self._rest = self._rest or observations
-        return True
+        moved = self._moved(first, observations) or (self._rest is not None and self._moved(self._rest, observations))
+        still = not moved and not self._shaken()
+        self._rest = (self._rest or observations) if still else None
+        return still
 
     def _moved(self, then: Observations, now: Observations) -> bool:
         a, b = matches(then, now)
         return len(a) < MIN_MATCHES or bool(np.median(np.linalg.norm(b - a, axis=1)) > self._max_shift)
 
+    def _shaken(self) -> bool:
+        gyro, accel = self._imu()
+        return bool(gyro.std(axis=0).max() > MAX_GYRO_STD or accel.std(axis=0).max() > MAX_ACCEL_STD)
+
     def mean_imu(self) -> tuple[F64, F64]:
         """Mean rate (3,) and specific force (3,) over the span."""
-        return tuple(np.mean(np.concatenate([s[i] for _, s in list(self._past)[1:] if s is not None]), axis=0)
-                     for i in (1, 2))  # type: ignore[return-value]
+        gyro, accel = self._imu()
+        return gyro.mean(axis=0), accel.mean(axis=0)
+
+    def _imu(self) -> tuple[F64, F64]:
+        """Rates (N, 3) and specific forces (N, 3) of the span."""
+        blocks = [samples for _, samples in list(self._past)[1:] if samples is not None]
+        return np.concatenate([gyro for _, gyro, _ in blocks]), np.concatenate([accel for _, _, accel in blocks])

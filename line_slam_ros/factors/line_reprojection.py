@@ -1,7 +1,7 @@
 """A segment's reprojection residual and its Jacobians, compiled and allocation free.
 
 Source: distance of the observed ends to the projected line, equations (11) to (17) of the line
-document with (15) corrected; see docs/line-geometry.md.
+document with (15) corrected.
 """
 import numpy as np
 from numba import njit
@@ -54,7 +54,7 @@ def line_reprojection(R_WB, p_WB, R_BC, p_BC, n_W, d_W, ends, r, J_pose, J_ext, 
 
     ends (2, 2) -> fills r (2,), J_pose (2, 6), J_ext (2, 6) ([rotation, position]) and
     J_line (2, 6) with respect to (n_W, d_W). Returns False, filling nothing, when the line passes
-    the optical centre along the axis and has no image (|n_C[:2]| below 1e-9 |d|).
+    the optical centre along the axis and has no image (see NO_IMAGE).
     """
     nb0, nb1, nb2, db0, db1, db2, nc0, nc1, nc2 = _in_body_and_camera(R_WB, p_WB, R_BC, p_BC, n_W, d_W)
     rho2 = nc0 * nc0 + nc1 * nc1

@@ -3,6 +3,7 @@ from numba import njit
 
 MIN_DEPTH = 1e-3  # m: nearer, or behind, a point has no image
 
+
 @njit(cache=True, nogil=True, error_model='numpy')
 def _in_body_and_camera(R_WB, p_WB, R_BC, p_BC, p_W):
     """(p_B, p_C) as six numbers."""
