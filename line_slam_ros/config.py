@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
+from line_slam_ros.types import LINE_FORMS
+
 
 def param(default: Any, description: str, low: float | None = None, high: float | None = None,
           choices: tuple[str, ...] = ()) -> Any:
@@ -64,8 +66,8 @@ class Estimator(Checked):
     window: int = param(13, 'states in the sliding window, keyframes and newest frame', 4, 40)
     max_iterations: int = param(4, 'optimiser iterations per frame', 1, 50)
     point_sigma_px: float = param(0.3, 'standard deviation of a tracked corner, px', 0.05, 20.0)
-    line_representation: str = param('orthonormal', 'line parameters: orthonormal (4) or host (2)',
-                                     choices=('orthonormal', 'host'))
+    line_representation: str = param('orthonormal', 'numbers that a line is estimated in; see docs/line-geometry.md',
+                                     choices=LINE_FORMS)
     line_min_views: int = param(3, 'states that must see a line before it gets a 3D estimate', 2, 20)
     line_min_parallax_deg: float = param(2.0, 'angle between observation planes that starts a line, deg', 0.1, 45.0)
     loss_scale: float = param(2.5, 'Cauchy loss scale, standard deviations', 0.1, 100.0)

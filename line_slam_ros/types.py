@@ -6,7 +6,7 @@ to A. Normalised image coordinates ``x`` are undistorted, on the plane z = 1; pi
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import Enum, IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,41 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
 Samples = tuple[F64, F64, F64]  # t (N,) s from the first, gyro (N, 3) rad/s, accel (N, 3) m/s^2
+
+
+class LineForm(IntEnum):
+    """What the numbers of an estimated line are; geometry/line_forms.py has the mathematics of each."""
+
+    ORTHONORMAL = 0  # frame U and angle phi, right update
+    ORTHONORMAL_LEFT = 1  # the same storage, left update
+    PLUECKER = 2  # six numbers, put back on the quadric n . d = 0 by each update
+    ORTH4 = 3  # Euler angles of U and phi, as other line code stores it; refuses lines near its singularities
+    HOST = 4  # inverse range and angle in the plane in which the first camera saw the line
+    HOST_FREE = 5  # the same, and that plane may tilt: four degrees of freedom again
+
+    @staticmethod
+    def of(name: str) -> LineForm:
+        """By its name in lower case. ValueError for another."""
+        try:
+            return LineForm[name.upper()]
+        except KeyError:
+            raise ValueError(f'line form must be one of {", ".join(LINE_FORMS)}, got {name!r}') from None
+
+    @property
+    def freedom(self) -> int:
+        """Numbers that an update has."""
+        return 2 if self is LineForm.HOST else 4
+
+
+LINE_FORMS = tuple(form.name.lower() for form in LineForm)
+
+
+class Loss(IntEnum):
+    """What an outlier costs; factors/robust.py."""
+
+    L2 = 0
+    HUBER = 1
+    CAUCHY = 2
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from line_slam_ros.estimation.stillness import Stillness
 from line_slam_ros.geometry.imu import between
 from line_slam_ros.geometry.lie import so3_exp
 from line_slam_ros.simulation.features import GRAVITY_W, Room, Sequence, Trajectory, calibration
-from line_slam_ros.types import LineObservations, PointObservations
+from line_slam_ros.types import LINE_FORMS, LineObservations, PointObservations
 
 NO_LINES = LineObservations(np.empty(0, np.int64), np.empty((0, 2, 2)), np.empty((0, 2)))
 NO_POINTS = PointObservations(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2)))
@@ -55,7 +55,7 @@ def moving():
     return Sequence(Trajectory.random(2), Room.random(2), calibration(), 10.0)
 
 
-@pytest.mark.parametrize('representation', ['orthonormal', 'host'])
+@pytest.mark.parametrize('representation', LINE_FORMS)
 def test_starts_in_motion_and_tracks_to_a_centimetre_per_metre(moving, representation):
     _, t, p, _, failures = run(moving, Options(line_representation=representation))
     assert t[0] <= 3.0

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from line_slam_ros.factors.line_reprojection import line_reprojection, line_residual, orthonormal_line
+from line_slam_ros.factors.line_reprojection import line_reprojection, line_residual
 from line_slam_ros.factors.point_reprojection import inverse_depth_point, point_reprojection, point_residual
 from line_slam_ros.geometry import host_line, lines, orthonormal
 from line_slam_ros.geometry.lie import pose_plus, rigid, rigid_inverse, so3_exp, transform_points
@@ -131,29 +131,6 @@ def test_line_without_an_image_is_refused_and_nothing_is_written():
 
 def test_not_a_number_in_the_state_is_refused():
     assert not line(np.eye(4), np.eye(4), np.full(6, np.nan), np.zeros((2, 2))).valid
-
-
-@pytest.mark.parametrize('origin', [(0.0, 0.0, 0.0), (3.0, -2.0, 100.0)])
-@pytest.mark.parametrize('phi', [0.0, 1e-6, 0.7, np.pi / 2, 2.0])
-def test_orthonormal_line_about_an_origin_and_its_tangent(origin, phi):
-    U, n_W, d_W, J = so3_exp([0.3, -1.0, 2.0]), np.empty(3), np.empty(3), np.empty((6, 4))
-    origin = np.array(origin)
-
-    def moved(delta):
-        frame, angle = orthonormal.plus_right(U, phi, delta)
-        orthonormal_line(frame, float(angle), origin, n_W, d_W, J)
-        return np.concatenate([n_W, d_W])
-
-    check(numeric(moved, 4, 1e-3), _tangent(U, phi, origin))
-    about_origin = orthonormal.pluecker_from_orthonormal(U, phi)
-    expected = lines.line_motion(rigid(np.eye(3), origin)) @ about_origin
-    np.testing.assert_allclose(moved(np.zeros(4)), expected, atol=1e-13)
-
-
-def _tangent(U, phi, origin):
-    J = np.empty((6, 4))
-    orthonormal_line(U, phi, origin, np.empty(3), np.empty(3), J)
-    return J
 
 
 def test_line_residual_by_the_four_parameters_is_the_chain_of_both(line_case):

@@ -6,15 +6,15 @@ from line_slam_ros.estimation.landmarks import back_substitute, retract_landmark
 from line_slam_ros.estimation.solver import Solver, SolverOptions, retract_states
 from line_slam_ros.estimation.window import STATE, Window
 from line_slam_ros.geometry.lie import so3_exp
+from line_slam_ros.geometry.line_forms import store_lines
 from line_slam_ros.geometry.lines import line_from_points
-from line_slam_ros.geometry.orthonormal import orthonormal_from_pluecker
-from line_slam_ros.types import ImuNoise
+from line_slam_ros.types import ImuNoise, LineForm
 
 STATES, POINTS, LINES, SIGMA, NOISE = 4, 20, 10, 0.02, 0.05
 R_BC, p_BC = so3_exp([0.1, 0.2, 0.3]), np.array([0.1, 0.0, 0.05])
 
 
-@pytest.fixture(params=[False, True], ids=['orthonormal', 'host'])
+@pytest.fixture(params=LineForm, ids=lambda form: form.name.lower())
 def solver(request):
     """A window in which nothing agrees: random states, links, prior, points and lines, outliers among them."""
     rng, window = np.random.default_rng(0), Window(STATES + 2, ImuNoise(), POINTS, LINES)
@@ -28,7 +28,7 @@ def solver(request):
     A = rng.normal(size=(dim, dim))
     window.prior_H[:dim, :dim], window.prior_g[:dim] = A @ A.T, rng.normal(size=dim)
     _fill_points(window, rng)
-    _fill_lines(window, rng)
+    _fill_lines(window, rng, request.param)
     return Solver(window, SolverOptions(R_BC, p_BC, np.array([0.0, 0.0, -9.81]), 4.0, 4.0, request.param))
 
 
@@ -42,14 +42,17 @@ def _fill_points(window, rng):
     table.sigma[:] = SIGMA
 
 
-def _fill_lines(window, rng):
+def _fill_lines(window, rng, form):
     table, n = window.lines, STATES
     table.count, table.solved[:] = LINES, True
     p_C = rng.normal(size=(LINES, 2, 3)) * [1, 1, 0.3] + [0, 0, 5]
     p_W = p_C @ (window.R[0] @ R_BC).T + window.R[0] @ p_BC + window.p[0]
     table.origin[:] = window.p[0]
-    table.U[:], table.phi[:] = orthonormal_from_pluecker(line_from_points(*np.moveaxis(p_W - window.p[0], 1, 0)))
-    table.rho[:] = rng.uniform(0.1, 0.4, LINES)
+    pluecker = line_from_points(*np.moveaxis(p_W - window.p[0], 1, 0))
+    stored = np.zeros(LINES, bool)
+    store_lines(int(form), pluecker, np.tile(window.R[0] @ R_BC, (LINES, 1, 1)), p_C[..., :2] / p_C[..., 2:],
+                table.values, stored)
+    assert stored.all()
     table.seen[:, :n] = rng.random((LINES, n)) < 0.8
     table.z[:, :n] = (p_C[..., :2] / p_C[..., 2:])[:, None] + NOISE * rng.normal(size=(LINES, n, 2, 2))
     table.sigma[:] = SIGMA
@@ -74,7 +77,7 @@ def test_eliminated_normal_equations_predict_the_slope_of_the_cost(solver, seed)
         solver._restore(before)
         retract_states(w.n, w.R, w.p, w.v, w.b, part * dx)
         retract_landmarks(use_points, w.points.abr, part * solver._step_p, use_lines,
-                          solver.options.host_lines, w.lines.U, w.lines.phi, w.lines.rho, part * solver._step_l)
+                          int(solver.options.line_form), w.lines.values, part * solver._step_l)
         return solver.cost()
 
     assert (cost(1e-5) - cost(-1e-5)) / 2e-5 == pytest.approx(predicted, rel=1e-6)

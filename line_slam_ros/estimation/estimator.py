@@ -11,8 +11,8 @@ from line_slam_ros.estimation.marginalisation import drop_state, marginalise_old
 from line_slam_ros.estimation.solver import Solver, SolverOptions
 from line_slam_ros.estimation.triangulation import start_lines, start_points
 from line_slam_ros.estimation.window import STATE, Window
-from line_slam_ros.factors.line_reprojection import world_line
-from line_slam_ros.types import F64, I64, Calibration, Observations, Samples
+from line_slam_ros.geometry.line_forms import unit_world_lines
+from line_slam_ros.types import F64, I64, Calibration, LineForm, Observations, Samples
 
 MAX_GYRO_BIAS, MAX_ACCEL_BIAS, MAX_SPEED = 0.5, 2.5, 50.0  # rad/s, m/s^2, m/s: beyond, the estimate is nonsense
 MIN_FEATURES = 6  # fewer that an earlier state saw, too, and the camera is blind
@@ -31,17 +31,6 @@ class WindowLines:
     T_WC: F64  # (n, 4, 4) camera poses of the states
 
 
-def world_lines(host: bool, U: F64, phi: F64, rho: F64, origin: F64) -> tuple[F64, F64]:
-    """Lines of the window (L, 3, 3), (L,), (L,), (L, 3) -> Pluecker (L, 6) with |d| = 1 and its tangent (L, 6, 4)."""
-    L, J = np.empty((len(phi), 6)), np.empty((len(phi), 6, 4))
-    for i in range(len(phi)):
-        world_line(host, U[i], phi[i], rho[i], origin[i], L[i, :3], L[i, 3:], J[i])
-    length = np.linalg.norm(L[:, 3:], axis=1)[:, None]
-    L = L / length
-    along = np.einsum('ni,nij->nj', L[:, 3:], J[:, 3:])
-    return L, (J - L[:, :, None] * along[:, None, :]) / length[:, :, None]
-
-
 class Estimator:
     """Owns the window. Slam feeds it frames; it never sees an image."""
 
@@ -53,8 +42,9 @@ class Estimator:
         self.window = Window(options.window + 1, calibration.imu_noise, int(rows * max_points), int(rows * max_lines))
         self.g_W = np.array([0.0, 0.0, -options.gravity])
         self.R_BC, self.p_BC = calibration.T_BC[:3, :3].copy(), calibration.T_BC[:3, 3].copy()
-        self.solver = Solver(self.window, SolverOptions(self.R_BC, self.p_BC, self.g_W, options.loss_scale**2,
-                                                        options.loss_scale**2, options.line_representation == 'host'))
+        self.solver = Solver(self.window, SolverOptions(
+            self.R_BC, self.p_BC, self.g_W, options.loss_scale**2, options.loss_scale**2,
+            LineForm.of(options.line_representation)))
         self.newest_is_keyframe = True
         self.failure = ''
         self._last_sight_ns = 0
@@ -129,7 +119,7 @@ class Estimator:
         self.linearise()
         w, t, n = self.window, self.window.lines, self.window.n
         rows = np.flatnonzero(t.solved[:t.count])
-        pluecker, J = world_lines(self.solver.options.host_lines, t.U[rows], t.phi[rows], t.rho[rows], t.origin[rows])
+        pluecker, J = unit_world_lines(int(self.solver.options.line_form), t.values[rows], t.origin[rows])
         cov = J @ self.solver.line_covariances(rows) @ J.transpose(0, 2, 1)
         T_WC = np.tile(np.eye(4), (n, 1, 1))
         T_WC[:, :3, :3], T_WC[:, :3, 3] = w.R[:n] @ self.R_BC, w.p[:n] + w.R[:n] @ self.p_BC
@@ -200,7 +190,7 @@ class Estimator:
         todo = ~q.solved[:q.count] & (q.seen[:q.count].sum(axis=1) >= self.options.line_min_views)
         min_sine = np.sin(np.radians(self.options.line_min_parallax_deg))
         start_lines(n, w.R, w.p, self.R_BC, self.p_BC, todo, q.seen, q.z, min_sine,
-                    o.host_lines, q.U, q.phi, q.rho, q.origin, q.solved)
+                    int(o.line_form), q.values, q.origin, q.solved)
 
     def _cull(self) -> tuple[I64, I64]:
         """Landmarks whose newest view fails the chi-square gate lose it; those mostly wrong go for good."""

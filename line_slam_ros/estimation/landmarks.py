@@ -8,23 +8,18 @@ import numpy as np
 from numba import njit
 
 from line_slam_ros.estimation.window import STATE
-from line_slam_ros.factors.line_reprojection import line_reprojection, line_residual, world_line
+from line_slam_ros.factors.line_reprojection import line_reprojection, line_residual
 from line_slam_ros.factors.point_reprojection import inverse_depth_point, point_reprojection, point_residual
-from line_slam_ros.geometry.lie_kernels import retract_rotation
+from line_slam_ros.factors.robust import CAUCHY, robust
+from line_slam_ros.geometry.line_forms import move_line, world_line
 
 BEHIND = 100.0  # cost of a point behind its camera, squared standard deviations (a rejected step, not a gradient)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def cauchy(s, c2):
-    """Cost and weight of a squared whitened residual s: rho = c2 log(1 + s / c2), w = 1 / (1 + s / c2)."""
-    return c2 * np.log(1.0 + s / c2), 1.0 / (1.0 + s / c2)
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
 def _weigh(r, sigma, c2, J_pose, scale):
     """Whiten r (2,) by sigma (2,) and weigh it robustly, J_pose (2, 6) alike; scale (2,) is what to multiply by."""
-    _, w = cauchy((r[0] / sigma[0]) ** 2 + (r[1] / sigma[1]) ** 2, c2)
+    _, w = robust(CAUCHY, (r[0] / sigma[0]) ** 2 + (r[1] / sigma[1]) ** 2, c2)
     for k in range(2):
         scale[k] = np.sqrt(w) / sigma[k]
         r[k] *= scale[k]
@@ -158,8 +153,8 @@ def add_points(n, R, p, R0, p0, R_BC, p_BC, use, seen, z, sigma, abr, R_WA, p_WA
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def add_lines(n, R, p, R0, p0, R_BC, p_BC, use, seen, z, sigma, host, U, phi, rho, origin, c2, damping, H, g, E, A, a):
-    """As add_points, for lines in either form (see world_line): E (M, n, 4, 6), A (M, 4, 4), a (M, 4)."""
+def add_lines(n, R, p, R0, p0, R_BC, p_BC, use, seen, z, sigma, form, values, origin, c2, damping, H, g, E, A, a):
+    """As add_points, for lines in any form (see geometry/line_forms.py): E (M, n, 4, 6), A (M, 4, 4), a (M, 4)."""
     r, q, J_pose, J_ext, J_l = np.empty(2), np.empty(2), np.empty((2, 6)), np.empty((2, 6)), np.empty((2, 6))
     n_W, d_W, C = np.empty(3), np.empty(3), np.empty((6, 4))
     J, Y, L, scale = np.empty((2, 4)), np.empty((6, 4)), np.empty((4, 4)), np.empty(2)
@@ -167,7 +162,7 @@ def add_lines(n, R, p, R0, p0, R_BC, p_BC, use, seen, z, sigma, host, U, phi, rh
         A[i], a[i] = 0.0, 0.0
         if not use[i]:
             continue
-        world_line(host, U[i], phi[i], rho[i], origin[i], n_W, d_W, C)
+        world_line(form, values[i], origin[i], n_W, d_W, C)
         for f in range(n):
             E[i, f] = 0.0
             if not seen[i, f]:
@@ -226,29 +221,29 @@ def point_cost(n, R, p, R_BC, p_BC, use, seen, z, sigma, abr, R_WA, p_WA, c2, rh
                 chi2[i, f] = BEHIND
                 continue
             chi2[i, f] = (r[0] / sigma[i, f, 0]) ** 2 + (r[1] / sigma[i, f, 1]) ** 2
-            cost += cauchy(chi2[i, f], c2)[0]
+            cost += robust(CAUCHY, chi2[i, f], c2)[0]
     return 0.5 * cost
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def line_cost(n, R, p, R_BC, p_BC, use, seen, z, sigma, host, U, phi, rho, origin, c2, chi2):
+def line_cost(n, R, p, R_BC, p_BC, use, seen, z, sigma, form, values, origin, c2, chi2):
     """Robust cost of the lines; chi2 (M, n) as in point_cost."""
     r, n_W, d_W, C = np.empty(2), np.empty(3), np.empty(3), np.empty((6, 4))
     cost = 0.0
     for i in range(len(use)):
         if not use[i]:
             continue
-        world_line(host, U[i], phi[i], rho[i], origin[i], n_W, d_W, C)
+        world_line(form, values[i], origin[i], n_W, d_W, C)
         for f in range(n):
             chi2[i, f] = -1.0
             if seen[i, f] and line_residual(R[f], p[f], R_BC, p_BC, n_W, d_W, z[i, f], r):
                 chi2[i, f] = (r[0] / sigma[i, f, 0]) ** 2 + (r[1] / sigma[i, f, 1]) ** 2
-                cost += cauchy(chi2[i, f], c2)[0]
+                cost += robust(CAUCHY, chi2[i, f], c2)[0]
     return 0.5 * cost
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def retract_landmarks(use_points, abr, point_step, use_lines, host, U, phi, rho, line_step):
+def retract_landmarks(use_points, abr, point_step, use_lines, form, values, line_step):
     """Apply landmark steps in place; an inverse depth may shrink to a fifth per step but stays positive."""
     for i in range(len(use_points)):
         if use_points[i]:
@@ -256,9 +251,5 @@ def retract_landmarks(use_points, abr, point_step, use_lines, host, U, phi, rho,
             abr[i, 1] += point_step[i, 1]
             abr[i, 2] = max(abr[i, 2] + point_step[i, 2], 0.2 * abr[i, 2], 1e-4)
     for i in range(len(use_lines)):
-        if use_lines[i] and host:
-            phi[i] = (phi[i] + line_step[i, 0] + np.pi) % (2.0 * np.pi) - np.pi
-            rho[i] = max(rho[i] + line_step[i, 1], 0.2 * rho[i], 1e-4)
-        elif use_lines[i]:
-            retract_rotation(U[i], line_step[i, :3], U[i])
-            phi[i] += line_step[i, 3]
+        if use_lines[i]:
+            move_line(form, values[i], line_step[i], values[i])

@@ -13,14 +13,22 @@ from line_slam_ros.estimation.line_solver import refine_lines
 from line_slam_ros.estimation.line_start import start_from_planes
 from line_slam_ros.frontend.front_end import FrontEnd
 from line_slam_ros.geometry.camera import Camera
-from line_slam_ros.geometry.host_line import host_frame, rho_theta_from_pluecker
 from line_slam_ros.geometry.lie import rigid
-from line_slam_ros.geometry.lines import transform_lines
-from line_slam_ros.geometry.orthonormal import orthonormal_from_pluecker
+from line_slam_ros.geometry.line_forms import VALUES, store_lines
 from line_slam_ros.mapping.line_map import LineMap
 from line_slam_ros.mapping.table import IdTable
 from line_slam_ros.mapping.views import add_view, view_columns
-from line_slam_ros.types import F64, I64, Calibration, Estimate, Frame, LineObservations, LineSegments, Status
+from line_slam_ros.types import (
+    F64,
+    I64,
+    Calibration,
+    Estimate,
+    Frame,
+    LineForm,
+    LineObservations,
+    LineSegments,
+    Status,
+)
 
 SHARED = 0.5  # a keyframe is due when fewer of the present lines were in the last one
 VIEWS = 256  # most views that a line is estimated from
@@ -129,7 +137,8 @@ class LineEstimator:
 
     def __init__(self, config: Config) -> None:
         self._options = config.estimator
-        self._table = IdTable(**view_columns(VIEWS), frame=((3, 3), np.float64), numbers=((2,), np.float64),
+        self._form = int(LineForm.of(config.estimator.line_representation))
+        self._table = IdTable(**view_columns(VIEWS), values=((VALUES,), np.float64),
                               origin=((3,), np.float64), started=((), np.bool_), pluecker=((6,), np.float64),
                               cov=((6, 6), np.float64), outliers=((), np.float64), newest=((), np.int64))
         self._keyframes = 0
@@ -203,18 +212,13 @@ class LineEstimator:
             return
         lines, origin, holds = start_from_planes(table['poses'][rows], table['ends'][rows], table['count'][rows],
                                                  np.sin(np.radians(options.line_min_parallax_deg)))
-        rows, lines, origin = rows[holds], lines[holds], origin[holds]
-        table['started'][rows], table['origin'][rows] = True, origin
-        if options.line_representation == 'host':
-            R_WH, R_HL = table['poses'][rows, 0, :, :3], host_frame(table['ends'][rows, 0])
-            T_HO = rigid(np.swapaxes(R_WH, -1, -2), np.zeros(3))
-            table['frame'][rows] = R_WH @ R_HL
-            table['numbers'][rows] = rho_theta_from_pluecker(transform_lines(T_HO, lines[:, None])[:, 0], R_HL)
-        else:
-            table['frame'][rows], table['numbers'][rows, 0] = orthonormal_from_pluecker(lines)
+        values, stored = np.empty((len(rows), VALUES)), np.empty(len(rows), np.bool_)
+        store_lines(self._form, lines, table['poses'][rows, 0, :, :3], table['ends'][rows, 0], values, stored)
+        rows, good = rows[holds & stored], holds & stored
+        table['started'][rows], table['origin'][rows], table['values'][rows] = True, origin[good], values[good]
 
     def _refine(self, rows: I64) -> None:
         table, options = self._table, self._options
-        refine_lines(rows, options.line_representation == 'host', table['poses'], table['ends'], table['sigma'],
-                     table['count'], table['frame'], table['numbers'], table['origin'], options.loss_scale**2,
-                     options.max_iterations, options.gate_chi2, table['pluecker'], table['cov'], table['outliers'])
+        refine_lines(rows, self._form, table['poses'], table['ends'], table['sigma'], table['count'], table['values'],
+                     table['origin'], options.loss_scale**2, options.max_iterations, options.gate_chi2,
+                     table['pluecker'], table['cov'], table['outliers'])

@@ -1,77 +1,153 @@
-"""One line at a time from views with known poses: Levenberg-Marquardt with Cauchy loss, compiled.
+"""Lines from views with known poses: Levenberg-Marquardt in any form and loss, compiled.
 
-Two forms of a line (see geometry/orthonormal.py and geometry/host_line.py), both about a constant origin in W:
-
-    orthonormal  frame = U, numbers = [phi, -]:           n = cos(phi) u1, d = sin(phi) u2
-    host         frame = R_WL, numbers = [rho, theta]:    n = -cos(theta) z, d = rho (cos(theta) x + sin(theta) y)
-
-with [x, y, z] the columns of R_WL and the host camera's centre as origin.
+With the poses given the normal equations fall apart into a small block per line, so nothing needs eliminating: each
+line is solved on its own (fit_line), or all together with one damping and one verdict on the total cost (fit_lines
+with joint), as a general solver would.
 """
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
-from line_slam_ros.factors.line_reprojection import line_reprojection, orthonormal_line
-from line_slam_ros.geometry.lie_kernels import retract_rotation
+from line_slam_ros.factors.line_reprojection import line_reprojection
+from line_slam_ros.factors.robust import CAUCHY, robust
+from line_slam_ros.geometry.line_forms import VALUES, freedom, move_line, unit_world_line, world_line
 
-DAMPING, MOST_DAMPING = 1e-4, 1e8  # of the diagonal, at the start and when giving up
+DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e8  # of the diagonal: at the start, at least, when giving up
 CONVERGED = 1e-6  # relative decrease of the cost
 BLIND = 1e6  # squared residual of a view in which the line has no image
 CHI2_MEDIAN = 1.386  # of chi-square with two degrees of freedom
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def refine_lines(rows, host, poses, ends, sigma, count, frame, numbers, origin, loss2, iterations, gate, pluecker, cov,
-                 outliers):
-    """Fit the lines in rows to all their views, starting from their present form.
+def fit_lines(form, loss, c2, joint, first, last, poses, ends, sigma, values, origin, iterations, tolerance, cost,
+              steps):
+    """Fit line i to its views first[i] <= k < last[i].
 
-    poses (N, K, 3, 4) = [R_WC, p_WC], ends (N, K, 2, 2), sigma (N, K, 2), count (N,): the views; loss2: squared
-    Cauchy scale; gate: squared whitened residual of an outlier. Updates frame (N, 3, 3), numbers (N, 2) and fills
-    pluecker (N, 6) with |d| = 1, cov (N, 6, 6) from the normal equations, widened when the residuals are larger than
-    sigma says, and outliers (N,), the share of views over the gate.
+    form, loss: of types.py; c2: squared scale of the loss; poses (M, 3, 4) = [R_WC, p_WC], ends (M, 2, 2), sigma
+    (M, 2) normalised: the views; values (L, VALUES), origin (L, 3): see geometry/line_forms.py. Takes at most that many
+    steps (those that would raise the cost are not taken, but tried again with more damping), fewer when one of them
+    lowers the cost by less than tolerance of it. Updates values and fills cost (L,), half the sum of the losses, and
+    steps (L,), how many were taken.
     """
-    size = 2 if host else 4
-    J, e2, sorted_e2 = np.empty((6, 4)), np.empty(poses.shape[1]), np.empty(poses.shape[1])
-    H, g, new_H, new_g = np.empty((4, 4)), np.empty(4), np.empty((4, 4)), np.empty(4)
-    new_frame, new_numbers, step = np.empty((3, 3)), np.empty(2), np.empty(4)
-    for i in rows:
-        views = count[i]
-        cost = _normal_equations(host, views, poses[i], ends[i], sigma[i], frame[i], numbers[i], origin[i], loss2, J, H,
-                                 g, e2)
-        damping = DAMPING
-        for _ in range(iterations):
-            before = cost
-            while damping < MOST_DAMPING:
-                _solve(H, damping, g, size, step)
-                _move(host, frame[i], numbers[i], step, new_frame, new_numbers)
-                cost = _normal_equations(host, views, poses[i], ends[i], sigma[i], new_frame, new_numbers, origin[i],
-                                         loss2, J, new_H, new_g, e2)
-                if cost <= before:
-                    break
-                damping *= 10.0
-            if damping >= MOST_DAMPING:
-                break
-            _copy(new_frame, new_numbers, frame[i], numbers[i])
-            H, new_H, g, new_g = new_H, H, new_g, g
-            damping = max(0.1 * damping, 1e-9)
-            if before - cost <= CONVERGED * before:
-                break
-        _normal_equations(host, views, poses[i], ends[i], sigma[i], frame[i], numbers[i], origin[i], loss2, J, H, g, e2)
-        over = 0
-        for k in range(views):
-            over += e2[k] > gate
-        outliers[i] = over / views
-        _to_world(host, frame[i], numbers[i], origin[i], J, pluecker[i])
-        _covariance(H, J, size, max(1.0, _median(e2[:views], sorted_e2) / CHI2_MEDIAN), cov[i])
+    if joint:
+        _fit_jointly(form, loss, c2, first, last, poses, ends, sigma, values, origin, iterations, tolerance, cost,
+                     steps)
+        return
+    e2 = np.empty(len(poses))
+    for i in range(len(first)):
+        own = slice(first[i], last[i])
+        cost[i], steps[i] = fit_line(form, loss, c2, poses[own], ends[own], sigma[own], values[i], origin[i],
+                                     iterations, tolerance, e2[own])
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def _copy(frame, numbers, to_frame, to_numbers):
-    for a in range(3):
-        for b in range(3):
-            to_frame[a, b] = frame[a, b]
-    to_numbers[0], to_numbers[1] = numbers[0], numbers[1]
+def fit_line(form, loss, c2, poses, ends, sigma, values, origin, iterations, tolerance, e2):
+    """One line; returns its cost and the number of steps taken. e2 (K,) is scratch."""
+    size = freedom(form)
+    H, g, new_H, new_g = np.empty((4, 4)), np.empty(4), np.empty((4, 4)), np.empty(4)
+    moved, step = np.empty(VALUES), np.empty(4)
+    cost, damping, taken = normal_equations(form, loss, c2, poses, ends, sigma, values, origin, H, g, e2), DAMPING, 0
+    while taken < iterations and damping < MOST_DAMPING:
+        _solve(H, damping, g, size, step)
+        move_line(form, values, step, moved)
+        new_cost = normal_equations(form, loss, c2, poses, ends, sigma, moved, origin, new_H, new_g, e2)
+        if not new_cost <= cost:
+            damping *= 10.0
+            continue
+        gain, cost, damping = cost - new_cost, new_cost, max(0.1 * damping, LEAST_DAMPING)
+        values[:], taken = moved, taken + 1
+        H, new_H, g, new_g = new_H, H, new_g, g
+        if gain <= tolerance * cost:
+            break
+    return cost, taken
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _fit_jointly(form, loss, c2, first, last, poses, ends, sigma, values, origin, iterations, tolerance, cost, steps):
+    """All lines with one damping; a step is taken by all or by none."""
+    size, lines = freedom(form), len(first)
+    H, g, step = np.empty((2, lines, 4, 4)), np.empty((2, lines, 4)), np.empty(4)
+    moved, new_cost, e2 = np.empty_like(values), np.empty(lines), np.empty(len(poses))
+    for i in range(lines):
+        own = slice(first[i], last[i])
+        cost[i] = normal_equations(form, loss, c2, poses[own], ends[own], sigma[own], values[i], origin[i], H[0, i],
+                                   g[0, i], e2[own])
+    at, damping, taken = 0, DAMPING, 0
+    while taken < iterations and damping < MOST_DAMPING:
+        for i in range(lines):
+            own = slice(first[i], last[i])
+            _solve(H[at, i], damping, g[at, i], size, step)
+            move_line(form, values[i], step, moved[i])
+            new_cost[i] = normal_equations(form, loss, c2, poses[own], ends[own], sigma[own], moved[i], origin[i],
+                                           H[1 - at, i], g[1 - at, i], e2[own])
+        gain = cost.sum() - new_cost.sum()
+        if not gain >= 0.0:
+            damping *= 10.0
+            continue
+        values[:], cost[:] = moved, new_cost
+        at, damping, taken = 1 - at, max(0.1 * damping, LEAST_DAMPING), taken + 1
+        if gain <= tolerance * cost.sum():
+            break
+    steps[:] = taken
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def refine_lines(rows, form, poses, ends, sigma, count, values, origin, c2, iterations, gate, pluecker, cov, outliers):
+    """Fit the lines in rows of a table to all their views, with Cauchy loss, starting from their present values.
+
+    poses (N, K, 3, 4), ends (N, K, 2, 2), sigma (N, K, 2), count (N,): the views; gate: squared whitened residual of
+    an outlier. Updates values (N, VALUES) and fills pluecker (N, 6) with |d| = 1, cov (N, 6, 6) from the normal
+    equations, widened when the residuals are larger than sigma says, and outliers (N,), the share of views over the
+    gate.
+    """
+    J, H, g = np.empty((6, 4)), np.empty((4, 4)), np.empty(4)
+    e2, sorted_e2 = np.empty(poses.shape[1]), np.empty(poses.shape[1])
+    for i in rows:
+        views = slice(0, count[i])
+        fit_line(form, CAUCHY, c2, poses[i, views], ends[i, views], sigma[i, views], values[i], origin[i], iterations,
+                 CONVERGED, e2[views])
+        normal_equations(form, CAUCHY, c2, poses[i, views], ends[i, views], sigma[i, views], values[i], origin[i], H,
+                         g, e2[views])
+        outliers[i] = np.sum(e2[views] > gate) / count[i]
+        unit_world_line(form, values[i], origin[i], pluecker[i], J)
+        _covariance(H, J, freedom(form), max(1.0, _median(e2[views], sorted_e2) / CHI2_MEDIAN), cov[i])
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def normal_equations(form, loss, c2, poses, ends, sigma, values, origin, H, g, e2):
+    """Of one line from K views: leading rows of H (4, 4), g (4,) and e2 (K,), the squared whitened residuals.
+
+    Returns the cost 0.5 sum rho(e2). A view that cannot see the line costs like an outlier and has no slope.
+    """
+    size = freedom(form)
+    n, d, J, A = np.empty(3), np.empty(3), np.empty((6, 4)), np.empty((2, 4))
+    r, J_pose, J_ext, J_line = np.empty(2), np.empty((2, 6)), np.empty((2, 6)), np.empty((2, 6))
+    identity, zero = np.eye(3), np.zeros(3)
+    world_line(form, values, origin, n, d, J)
+    H[:], g[:] = 0.0, 0.0
+    cost = 0.0
+    for k in range(len(poses)):
+        if not line_reprojection(poses[k, :, :3], poses[k, :, 3], identity, zero, n, d, ends[k], r, J_pose, J_ext,
+                                 J_line):
+            e2[k] = BLIND
+            cost += robust(loss, BLIND, c2)[0]
+            continue
+        for e in range(2):
+            r[e] /= sigma[k, e]
+            for a in range(size):
+                A[e, a] = 0.0
+                for b in range(6):
+                    A[e, a] += J_line[e, b] * J[b, a]
+                A[e, a] /= sigma[k, e]
+        e2[k] = r[0] * r[0] + r[1] * r[1]
+        rho, weight = robust(loss, e2[k], c2)
+        cost += rho
+        for a in range(size):
+            g[a] += weight * (A[0, a] * r[0] + A[1, a] * r[1])
+            for b in range(size):
+                H[a, b] += weight * (A[0, a] * A[0, b] + A[1, a] * A[1, b])
+    return 0.5 * cost
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -122,87 +198,3 @@ def _covariance(H, J, size, factor, cov):
             cov[c, b] = 0.0
             for a in range(size):
                 cov[c, b] += factor * J[c, a] * x[a]
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def _normal_equations(host, views, poses, ends, sigma, frame, numbers, origin, loss2, J, H, g, e2):
-    """Leading m rows of H (4, 4), g (4,) of the Cauchy cost 0.5 c^2 log(1 + e^2 / c^2) over the first views, e2 (K,)
-    their squared whitened residuals, J (6, 4) the tangent of [n, d]; returns the cost. A view that cannot see the line
-    costs like an outlier."""
-    size = 2 if host else 4
-    n, d, A = np.empty(3), np.empty(3), np.empty((2, 4))
-    r, J_pose, J_ext, J_line = np.empty(2), np.empty((2, 6)), np.empty((2, 6)), np.empty((2, 6))
-    identity, zero = np.eye(3), np.zeros(3)
-    _line(host, frame, numbers, origin, n, d, J)
-    for a in range(size):
-        g[a] = 0.0
-        for b in range(size):
-            H[a, b] = 0.0
-    cost = 0.0
-    for k in range(views):
-        if not line_reprojection(poses[k, :, :3], poses[k, :, 3], identity, zero, n, d, ends[k], r, J_pose, J_ext,
-                                 J_line):
-            e2[k] = BLIND
-            cost += 0.5 * loss2 * np.log(1.0 + e2[k] / loss2)
-            continue
-        for e in range(2):
-            r[e] /= sigma[k, e]
-            for a in range(size):
-                A[e, a] = 0.0
-                for b in range(6):
-                    A[e, a] += J_line[e, b] * J[b, a]
-                A[e, a] /= sigma[k, e]
-        e2[k] = r[0] * r[0] + r[1] * r[1]
-        weight = 1.0 / (1.0 + e2[k] / loss2)
-        cost += 0.5 * loss2 * np.log(1.0 + e2[k] / loss2)
-        for a in range(size):
-            g[a] += weight * (A[0, a] * r[0] + A[1, a] * r[1])
-            for b in range(size):
-                H[a, b] += weight * (A[0, a] * A[0, b] + A[1, a] * A[1, b])
-    return cost
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def _line(host, frame, numbers, origin, n, d, J):
-    """World line n (3,), d (3,) of either form and its tangent J (6, :m)."""
-    if not host:
-        orthonormal_line(frame, numbers[0], origin, n, d, J)
-        return
-    rho, cosine, sine = numbers[0], np.cos(numbers[1]), np.sin(numbers[1])
-    for i in range(3):
-        x, y, z = frame[i, 0], frame[i, 1], frame[i, 2]
-        n[i], d[i] = -cosine * z, rho * (cosine * x + sine * y)
-        J[i, 0], J[3 + i, 0] = 0.0, cosine * x + sine * y
-        J[i, 1], J[3 + i, 1] = sine * z, rho * (cosine * y - sine * x)
-    n[0] += origin[1] * d[2] - origin[2] * d[1]
-    n[1] += origin[2] * d[0] - origin[0] * d[2]
-    n[2] += origin[0] * d[1] - origin[1] * d[0]
-    for j in range(2):
-        J[0, j] += origin[1] * J[5, j] - origin[2] * J[4, j]
-        J[1, j] += origin[2] * J[3, j] - origin[0] * J[5, j]
-        J[2, j] += origin[0] * J[4, j] - origin[1] * J[3, j]
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def _move(host, frame, numbers, step, new_frame, new_numbers):
-    """The form's own update: right on U, additive on phi; additive on rho and theta."""
-    if host:
-        _copy(frame, numbers, new_frame, new_numbers)
-        new_numbers[0], new_numbers[1] = numbers[0] + step[0], numbers[1] + step[1]
-    else:
-        retract_rotation(frame, step[:3], new_frame)
-        new_numbers[0], new_numbers[1] = numbers[0] + step[3], 0.0
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def _to_world(host, frame, numbers, origin, J, pluecker):
-    """pluecker (6,) with |d| = 1 and its tangent J (6, 4): of L / |d| it is (dL - (L / |d|) (d . dd) / |d|) / |d|."""
-    n, d = np.empty(3), np.empty(3)
-    _line(host, frame, numbers, origin, n, d, J)
-    length = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-    for i in range(3):
-        pluecker[i], pluecker[3 + i] = n[i] / length, d[i] / length
-    for j in range(2 if host else 4):
-        along = pluecker[3] * J[3, j] + pluecker[4] * J[4, j] + pluecker[5] * J[5, j]
-        for i in range(6):
-            J[i, j] = (J[i, j] - pluecker[i] * along) / length

@@ -22,7 +22,7 @@ from line_slam_ros.estimation.landmarks import (
 from line_slam_ros.estimation.window import STATE, Window, state_difference
 from line_slam_ros.factors.imu_factor import imu_jacobians, imu_residual
 from line_slam_ros.geometry.lie_kernels import retract_rotation
-from line_slam_ros.types import F64
+from line_slam_ros.types import F64, LineForm
 
 CONVERGED = 1.0  # change of the cost (half squared standard deviations) below which iterating ends
 
@@ -89,7 +89,7 @@ class SolverOptions:
     g_W: F64  # (3,) m/s^2
     point_c2: float  # Cauchy scale of points, squared standard deviations
     line_c2: float
-    host_lines: bool = False  # 2-parameter lines in their host's observation plane
+    line_form: LineForm = LineForm.ORTHONORMAL
     rho0: float = 0.3  # 1/m, where points without parallax are believed to be
     w_rho: float = 0.03  # m, weight of that belief: thousands of points must not add up to a belief in scale
     still_speed: float = 0.01  # m/s, how still a body at rest is
@@ -128,8 +128,8 @@ class Solver:
         add_points(n, w.R, w.p, w.R0, w.p0, o.R_BC, o.p_BC, use_points, t.seen, t.z, t.sigma, t.abr, t.R_WA, t.p_WA,
                    o.point_c2, o.rho0, o.w_rho, damping, self.H, self.g, self._E_p, self._A_p, self._a_p)
         t = w.lines
-        add_lines(n, w.R, w.p, w.R0, w.p0, o.R_BC, o.p_BC, use_lines, t.seen, t.z, t.sigma, o.host_lines, t.U,
-                  t.phi, t.rho, t.origin, o.line_c2, damping, self.H, self.g, self._E_l, self._A_l, self._a_l)
+        add_lines(n, w.R, w.p, w.R0, w.p0, o.R_BC, o.p_BC, use_lines, t.seen, t.z, t.sigma, int(o.line_form),
+                  t.values, t.origin, o.line_c2, damping, self.H, self.g, self._E_l, self._A_l, self._a_l)
         mirror(n, self.H)
 
     def _add_rest(self, first: int, last: int, end: int) -> None:
@@ -170,8 +170,8 @@ class Solver:
         return (prior + self._rest_cost() + self.inertial_cost()
                 + point_cost(n, w.R, w.p, o.R_BC, o.p_BC, p.solved[:p.count], p.seen, p.z, p.sigma, p.abr, p.R_WA,
                              p.p_WA, o.point_c2, o.rho0, o.w_rho, self.chi2_points)
-                + line_cost(n, w.R, w.p, o.R_BC, o.p_BC, q.solved[:q.count], q.seen, q.z, q.sigma, o.host_lines,
-                            q.U, q.phi, q.rho, q.origin, o.line_c2, self.chi2_lines))
+                + line_cost(n, w.R, w.p, o.R_BC, o.p_BC, q.solved[:q.count], q.seen, q.z, q.sigma,
+                            int(o.line_form), q.values, q.origin, o.line_c2, self.chi2_lines))
 
     def inertial_cost(self) -> float:
         """Half the squared whitened residuals of all inertial links."""
@@ -211,8 +211,8 @@ class Solver:
         back_substitute(w.n, use_p, w.points.seen, 3, self._E_p, self._A_p, self._a_p, dx, self._step_p)
         back_substitute(w.n, use_l, w.lines.seen, 4, self._E_l, self._A_l, self._a_l, dx, self._step_l)
         retract_states(w.n, w.R, w.p, w.v, w.b, dx)
-        retract_landmarks(use_p, w.points.abr, self._step_p, use_l, self.options.host_lines,
-                          w.lines.U, w.lines.phi, w.lines.rho, self._step_l)
+        retract_landmarks(use_p, w.points.abr, self._step_p, use_l, int(self.options.line_form),
+                          w.lines.values, self._step_l)
         return True
 
     def _save(self) -> list[np.ndarray]:
@@ -226,8 +226,7 @@ class Solver:
     @staticmethod
     def _variables(w: Window) -> list[tuple[np.ndarray, int]]:
         n, p, q = w.n, w.points.count, w.lines.count
-        return [(w.R, n), (w.p, n), (w.v, n), (w.b, n), (w.points.abr, p), (w.lines.U, q), (w.lines.phi, q),
-                (w.lines.rho, q)]
+        return [(w.R, n), (w.p, n), (w.v, n), (w.b, n), (w.points.abr, p), (w.lines.values, q)]
 
     def covariance(self, slot: int) -> F64:
         """(15, 15) of one state given everything in the window; needs a fresh linearise."""

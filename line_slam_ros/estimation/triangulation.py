@@ -2,7 +2,7 @@
 import numpy as np
 from numba import njit
 
-from line_slam_ros.factors.line_reprojection import orthonormal_line
+from line_slam_ros.geometry.line_forms import store_line
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -56,14 +56,15 @@ def start_points(n, R, p, R_BC, p_BC, todo, seen, z, sigma, abr, R_WA, p_WA, rho
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def start_lines(n, R, p, R_BC, p_BC, todo, seen, z, min_sine, host, U, phi, rho, origin, solved):
-    """Lines of the rows in todo, in either form (see world_line), from all observation planes (multi-view SVD).
+def start_lines(n, R, p, R_BC, p_BC, todo, seen, z, min_sine, form, values, origin, solved):
+    """Lines of the rows in todo, in any form (geometry/line_forms.py), from all observation planes (multi-view SVD).
 
     Every view's plane (n_j, -n_j . p_j) holds the line, so the two smallest eigenvectors of the sum
     of their outer products span it. Rows stay unsolved when no two planes meet at more than
-    asin(min_sine) (motion along the line, in its plane, or too short) or an observed end lies behind a camera.
+    asin(min_sine) (motion along the line, in its plane, or too short), an observed end lies behind a camera, or the
+    form cannot hold the line.
     """
-    R_WC, p_WC, h = np.empty((3, 3)), np.empty(3), np.empty(3)
+    R_WC, p_WC, h, nd = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(6)
     normals, planes = np.empty((n, 3)), np.empty(4)
     for i in range(len(todo)):
         if not todo[i]:
@@ -90,42 +91,10 @@ def start_lines(n, R, p, R_BC, p_BC, todo, seen, z, min_sine, host, U, phi, rho,
         if views < 2 or _widest(normals, views) < min_sine:
             continue
         _, V = np.linalg.eigh(M)
-        if not _line_through(V[:, 0], V[:, 1], U[i], h):
-            continue
-        phi[i] = np.arctan2(h[1], h[0])
-        solved[i] = _in_front(n, R, p, R_BC, p_BC, seen[i], z[i], U[i], phi[i], origin[i])
-        if host and solved[i]:
+        if _line_through(V[:, 0], V[:, 1], nd) and _in_front(n, R, p, R_BC, p_BC, seen[i], z[i], nd, origin[i]):
             first = np.argmax(seen[i])
             camera_pose(R[first], p[first], R_BC, p_BC, R_WC, p_WC)
-            solved[i] = _pin_to_host(R_WC, z[i, first], U[i], phi[i:i + 1], rho[i:i + 1])
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def _pin_to_host(R_WC, ends, U, phi, rho):
-    """Orthonormal (U, phi) about the host camera -> host form, in place: nearest line in the host's observation plane.
-
-    rho = |y x d|^2 / ((y x d) . n) is the exact inverse range at which the bearing y passes the line.
-    False when the line is not in front or runs along y.
-    """
-    x, y, q = np.empty(3), np.empty(3), np.empty(3)
-    q[0], q[1] = ends[0, 1] - ends[1, 1], ends[1, 0] - ends[0, 0]
-    q[2] = ends[0, 0] * ends[1, 1] - ends[0, 1] * ends[1, 0]
-    m0, m1 = 0.5 * (ends[0, 0] + ends[1, 0]), 0.5 * (ends[0, 1] + ends[1, 1])
-    nq, nm = 1.0 / np.sqrt(q @ q), 1.0 / np.sqrt(m0 * m0 + m1 * m1 + 1.0)
-    n, d = np.cos(phi[0]) * U[:, 0].copy(), np.sin(phi[0]) * U[:, 1].copy()
-    zn = np.empty(3)
-    for i in range(3):
-        y[i] = nm * (R_WC[i, 0] * m0 + R_WC[i, 1] * m1 + R_WC[i, 2])
-        zn[i] = nq * (R_WC[i, 0] * q[0] + R_WC[i, 1] * q[1] + R_WC[i, 2] * q[2])
-    c = np.cross(y, d)
-    along = c @ n
-    if not along > 0.0:
-        return False
-    rho[0] = (c @ c) / along
-    x[:] = np.cross(y, zn)
-    phi[0] = np.arctan2(d @ y, d @ x)
-    U[:, 0], U[:, 1], U[:, 2] = x, y, zn
-    return rho[0] > 1e-4
+            solved[i] = store_line(form, nd[:3], nd[3:], R_WC, z[i, first], values[i])
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -140,38 +109,27 @@ def _widest(normals, views):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def _line_through(A, B, U, norms):
-    """Points A, B (4,) -> U (3, 3) = [n, d, n x d] normalised, norms[:2] = |n|, |d|; False without direction."""
-    n0, n1, n2 = A[1] * B[2] - A[2] * B[1], A[2] * B[0] - A[0] * B[2], A[0] * B[1] - A[1] * B[0]
-    d0, d1, d2 = A[3] * B[0] - B[3] * A[0], A[3] * B[1] - B[3] * A[1], A[3] * B[2] - B[3] * A[2]
-    nn, nd = np.sqrt(n0 * n0 + n1 * n1 + n2 * n2), np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
-    if nd < 1e-9 or nn < 1e-6 * nd:
-        return False
-    norms[0], norms[1] = nn, nd
-    n0, n1, n2 = n0 / nn, n1 / nn, n2 / nn
-    k = (n0 * d0 + n1 * d1 + n2 * d2)
-    d0, d1, d2 = d0 - k * n0, d1 - k * n1, d2 - k * n2
-    nd = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
-    d0, d1, d2 = d0 / nd, d1 / nd, d2 / nd
-    U[0, 0], U[1, 0], U[2, 0] = n0, n1, n2
-    U[0, 1], U[1, 1], U[2, 1] = d0, d1, d2
-    U[0, 2], U[1, 2], U[2, 2] = n1 * d2 - n2 * d1, n2 * d0 - n0 * d2, n0 * d1 - n1 * d0
-    return True
+def _line_through(A, B, nd):
+    """Points A, B (4,) -> nd (6,) = [n, d]; False without direction or, as no camera sees it, through the origin."""
+    nd[0], nd[1], nd[2] = A[1] * B[2] - A[2] * B[1], A[2] * B[0] - A[0] * B[2], A[0] * B[1] - A[1] * B[0]
+    nd[3], nd[4], nd[5] = A[3] * B[0] - B[3] * A[0], A[3] * B[1] - B[3] * A[1], A[3] * B[2] - B[3] * A[2]
+    nn = np.sqrt(nd[0] * nd[0] + nd[1] * nd[1] + nd[2] * nd[2])
+    dd = np.sqrt(nd[3] * nd[3] + nd[4] * nd[4] + nd[5] * nd[5])
+    return dd > 1e-9 and nn > 1e-6 * dd
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def _in_front(n, R, p, R_BC, p_BC, seen, z, U, phi, origin):
-    """Whether every view sees the line's feet of its observed ends at positive depth."""
-    R_WC, p_WC, n_W, d_W, C = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3), np.empty((6, 4))
-    n_C, d_C = np.empty(3), np.empty(3)
-    orthonormal_line(U, phi, origin, n_W, d_W, C)
+def _in_front(n, R, p, R_BC, p_BC, seen, z, nd, origin):
+    """Whether every view sees the feet of its observed ends on line nd (6,) about the origin at positive depth."""
+    R_WC, p_WC, n_C, d_C = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
+    n_O, d_W = nd[:3], nd[3:]
     for f in range(n):
         if not seen[f]:
             continue
         camera_pose(R[f], p[f], R_BC, p_BC, R_WC, p_WC)
-        h0 = n_W[0] - (p_WC[1] * d_W[2] - p_WC[2] * d_W[1])
-        h1 = n_W[1] - (p_WC[2] * d_W[0] - p_WC[0] * d_W[2])
-        h2 = n_W[2] - (p_WC[0] * d_W[1] - p_WC[1] * d_W[0])
+        t0, t1, t2 = p_WC[0] - origin[0], p_WC[1] - origin[1], p_WC[2] - origin[2]
+        h0, h1 = n_O[0] - (t1 * d_W[2] - t2 * d_W[1]), n_O[1] - (t2 * d_W[0] - t0 * d_W[2])
+        h2 = n_O[2] - (t0 * d_W[1] - t1 * d_W[0])
         for k in range(3):
             n_C[k] = R_WC[0, k] * h0 + R_WC[1, k] * h1 + R_WC[2, k] * h2
             d_C[k] = R_WC[0, k] * d_W[0] + R_WC[1, k] * d_W[1] + R_WC[2, k] * d_W[2]

@@ -9,6 +9,7 @@ from numba import njit
 
 from line_slam_ros.geometry.imu import preintegrate
 from line_slam_ros.geometry.lie_kernels import log_so3, multiply_transposed
+from line_slam_ros.geometry.line_forms import VALUES
 from line_slam_ros.types import F64, I64, ImuNoise, Samples
 
 REST_S = 2.0  # longer at rest, the accelerometer only ties tilt and bias ever tighter: too stiff to solve, nothing new
@@ -112,7 +113,7 @@ class Window:
         self.samples: list[Samples] = []  # raw t (s), gyro, accel of each link
         self.prior_H, self.prior_g = np.zeros((STATE * slots, STATE * slots)), np.zeros(STATE * slots)
         self.points = LandmarkTable(max_points, slots, (2,), {'abr': (3,), 'R_WA': (3, 3), 'p_WA': (3,)})
-        self.lines = LandmarkTable(max_lines, slots, (2, 2), {'U': (3, 3), 'phi': (), 'rho': (), 'origin': (3,)})
+        self.lines = LandmarkTable(max_lines, slots, (2, 2), {'values': (VALUES,), 'origin': (3,)})
 
     def clear(self) -> None:
         """Back to an empty window."""
