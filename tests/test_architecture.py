@@ -18,7 +18,7 @@ LAYERS = (
     ('factors',),
     ('frontend', 'estimation', 'mapping', 'simulation'),
     ('slam', 'warm_up', 'inbox', 'imu_buffer', 'pose_buffer', 'notes', 'calibration', 'shell_config', 'config_file',
-     'ros_conventions', 'evaluation'),
+     'ros_conventions', 'evaluation', 'experiment', 'benchmark'),
     ('msg_adapters',),
     ('nodes', 'cli'),
 )

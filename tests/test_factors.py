@@ -82,6 +82,7 @@ def line_case(request):
     return SimpleNamespace(T_WB=T_WB, T_BC=T_BC, L_W=L_W, ends=ends + 0.01 * rng.normal(size=(2, 2)), h=1e-3 * size)
 
 
+@pytest.mark.row(13, 25)
 def test_exact_ends_leave_no_line_residual():
     rng = np.random.default_rng(0)
     for _ in range(20):
@@ -90,6 +91,7 @@ def test_exact_ends_leave_no_line_residual():
         np.testing.assert_allclose(line(T_WB, T_BC, L_W, to_image(p_C)).r, 0, atol=1e-13)
 
 
+@pytest.mark.row(13)
 def test_line_residual_is_the_distance_in_the_image_whatever_the_factor_on_the_line(line_case):
     c = line_case
     found = line(c.T_WB, c.T_BC, c.L_W, c.ends)
@@ -103,24 +105,30 @@ def test_line_residual_is_the_distance_in_the_image_whatever_the_factor_on_the_l
     np.testing.assert_allclose(line(c.T_WB, c.T_BC, -c.L_W, c.ends).r, -found.r, atol=1e-12)
 
 
+@pytest.mark.row(16, 25)
+@pytest.mark.trap('extrinsic not the identity')
 def test_line_jacobian_by_the_body_pose(line_case):
     c = line_case
     check(line(c.T_WB, c.T_BC, c.L_W, c.ends).J_pose,
           numeric(lambda d: line(pose_plus(c.T_WB, d), c.T_BC, c.L_W, c.ends).r, 6, c.h))
 
 
+@pytest.mark.row(17, 25)
+@pytest.mark.trap('extrinsic not the identity')
 def test_line_jacobian_by_the_extrinsic(line_case):
     c = line_case
     check(line(c.T_WB, c.T_BC, c.L_W, c.ends).J_ext,
           numeric(lambda d: line(c.T_WB, pose_plus(c.T_BC, d), c.L_W, c.ends).r, 6, c.h))
 
 
+@pytest.mark.row(14, 25)
 def test_line_jacobian_by_the_six_pluecker_numbers(line_case):
     c = line_case
     check(line(c.T_WB, c.T_BC, c.L_W, c.ends).J_line,
           numeric(lambda d: line(c.T_WB, c.T_BC, c.L_W + d, c.ends).r, 6, 0.1 * c.h))
 
 
+@pytest.mark.row(13)
 def test_line_without_an_image_is_refused_and_nothing_is_written():
     through_centre = lines.line_through([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     found = line(np.eye(4), np.eye(4), through_centre, np.zeros((2, 2)))
@@ -133,6 +141,7 @@ def test_not_a_number_in_the_state_is_refused():
     assert not line(np.eye(4), np.eye(4), np.full(6, np.nan), np.zeros((2, 2))).valid
 
 
+@pytest.mark.row(15, 25)
 def test_line_residual_by_the_four_parameters_is_the_chain_of_both(line_case):
     c = line_case
     U, phi = orthonormal.orthonormal_from_pluecker(c.L_W)
@@ -161,6 +170,9 @@ def in_camera(v, T_WBi, T_WBj, T_BC, L_Ci):
     return line(T_WBj, T_BC, lines.line_motion(T_WBi @ T_BC) @ L_Ci, v.ends_j)
 
 
+@pytest.mark.row(24, 26)
+@pytest.mark.trap('extrinsic not the identity')
+@pytest.mark.source_error('D2 in-camera factor')
 def test_host_anchored_line_factor_has_all_four_blocks(two_views):
     """Extrinsic block: both ends of the chain, the host's and the observer's."""
     v = two_views
@@ -175,6 +187,7 @@ def test_host_anchored_line_factor_has_all_four_blocks(two_views):
     check(by_line, numeric(lambda d: in_camera(v, v.T_WBi, v.T_WBj, v.T_BC, v.L_Ci + d).r, 6, 1e-4))
 
 
+@pytest.mark.row(21)
 def test_two_parameter_factor_is_the_pluecker_factor_of_the_same_line_up_to_sign(two_views):
     v = two_views
     R_HL = host_line.host_frame(v.ends_i)
@@ -183,6 +196,7 @@ def test_two_parameter_factor_is_the_pluecker_factor_of_the_same_line_up_to_sign
     np.testing.assert_allclose(np.sign(two[0] * six[0]) * two, six, atol=1e-12)
 
 
+@pytest.mark.row(21)
 def test_two_parameter_factor_jacobian_by_rho_and_theta(two_views):
     v = two_views
     R_HL = host_line.host_frame(v.ends_i)
@@ -196,6 +210,8 @@ def test_two_parameter_factor_jacobian_by_rho_and_theta(two_views):
     check(chained, numeric(lambda d: residual(d).r, 2, 1e-4))
 
 
+@pytest.mark.row(22)
+@pytest.mark.source_error('D2 one-camera factor')
 def test_two_parameter_factor_in_its_own_host_is_void(two_views):
     v = two_views
     R_HL = host_line.host_frame(v.ends_i)
@@ -205,6 +221,7 @@ def test_two_parameter_factor_in_its_own_host_is_void(two_views):
     np.testing.assert_allclose(found.J_line @ host_line.jacobian([0.37, 1.1], R_HL), 0, atol=1e-14)
 
 
+@pytest.mark.row(23)
 def test_one_camera_factor_is_the_world_factor_with_the_camera_as_world(two_views):
     v = two_views
     alone = line(np.eye(4), np.eye(4), v.L_Ci, v.ends_i + 0.01)
@@ -213,6 +230,7 @@ def test_one_camera_factor_is_the_world_factor_with_the_camera_as_world(two_view
     np.testing.assert_allclose(alone.J_line, moved.J_line @ lines.line_motion(v.T_WBi @ v.T_BC), atol=1e-9)
 
 
+@pytest.mark.row(27)
 def test_start_frame_factor_has_the_line_block_of_the_relative_motion(two_views):
     """The line lives in the first camera; the observing camera's pose is relative to it."""
     v = two_views
@@ -261,6 +279,8 @@ def test_point_jacobian_by_the_point(point_case):
           numeric(lambda d: point(c.T_WB, c.T_BC, c.p_W + d, c.x).r, 3, c.h * max(1.0, c.p_C[2])))
 
 
+@pytest.mark.row(33)
+@pytest.mark.trap('points behind the camera')
 @pytest.mark.parametrize('depth', [0.0, -1.0, 1e-4, np.nan])
 def test_point_not_in_front_of_the_camera_is_refused_and_nothing_is_written(depth):
     found = point(np.eye(4), np.eye(4), np.array([0.1, 0.2, depth]), np.zeros(2))

@@ -17,6 +17,7 @@ def up_to_scale(L):
     return L * np.sign(np.take_along_axis(L, np.argmax(np.abs(L), axis=-1)[..., None], axis=-1))
 
 
+@pytest.mark.row(28)
 def test_local_frame_is_a_rotation_with_y_in_and_z_across_the_observation_plane(segments):
     _, ends = segments
     R_HL = host_line.host_frame(ends)
@@ -28,10 +29,13 @@ def test_local_frame_is_a_rotation_with_y_in_and_z_across_the_observation_plane(
     np.testing.assert_allclose(R_HL[..., 2], normal, atol=1e-12)
 
 
+@pytest.mark.row(28)
 def test_a_segment_without_length_has_no_local_frame():
     assert np.isnan(host_line.host_frame([[0.1, 0.2], [0.1, 0.2]])).any()
 
 
+@pytest.mark.row(30)
+@pytest.mark.source_error('D2 rho start')
 def test_exact_start_describes_the_line_through_the_points(segments):
     p_H, ends = segments
     R_HL, L_H = host_line.host_frame(ends), lines.line_from_points(p_H[:, 0], p_H[:, 1])
@@ -39,6 +43,8 @@ def test_exact_start_describes_the_line_through_the_points(segments):
     np.testing.assert_allclose(up_to_scale(found), up_to_scale(L_H), atol=1e-12)
 
 
+@pytest.mark.row(30)
+@pytest.mark.source_error('D2 rho')
 def test_rho_is_the_inverse_range_along_the_middle_ray(segments):
     p_H, ends = segments
     R_HL = host_line.host_frame(ends)
@@ -48,6 +54,7 @@ def test_rho_is_the_inverse_range_along_the_middle_ray(segments):
     np.testing.assert_allclose(lines.point_distance(L_H, R_HL[..., 1] / rho[:, None]), 0, atol=1e-12)
 
 
+@pytest.mark.row(30)
 def test_two_and_four_parameter_starts_are_the_same_line(segments):
     p_H, ends = segments
     R_HL, L_H = host_line.host_frame(ends), lines.line_from_points(p_H[:, 0], p_H[:, 1])
@@ -72,20 +79,24 @@ def test_jacobian_is_batched(segments):
     np.testing.assert_allclose(host_line.jacobian(x, R_HL), expected, atol=1e-15)
 
 
+@pytest.mark.row(20)
 @pytest.mark.parametrize('theta, wrapped', [(0.0, 0.0), (np.pi, -np.pi), (-np.pi, -np.pi), (3.5, 3.5 - 2 * np.pi),
                                             (-3.5, 2 * np.pi - 3.5), (7 * np.pi, -np.pi)])
 def test_theta_is_wrapped_into_minus_pi_to_pi(theta, wrapped):
     found = host_line.plus([0.2, 0.0], [0.1, theta])
     np.testing.assert_allclose(found, [0.3, wrapped], atol=1e-14)
     assert -np.pi <= found[1] < np.pi
+    assert host_line.plus([0.2, 0.0], [0.1, np.nextafter(-np.pi, -4.0)])[1] == -np.pi
 
 
+@pytest.mark.row(20)
 def test_half_a_turn_of_theta_is_the_same_line_backwards():
     R_HL = host_line.host_frame([[0.1, 0.2], [-0.3, 0.4]])
     forward, back = (host_line.pluecker_from_rho_theta([0.3, theta], R_HL) for theta in (0.4, 0.4 + np.pi))
     np.testing.assert_allclose(forward, -back, atol=1e-15)
 
 
+@pytest.mark.row(22)
 def test_the_hosts_own_residual_is_zero_whatever_rho_and_theta(segments):
     _, ends = segments
     R_HL, rng = host_line.host_frame(ends), np.random.default_rng(7)

@@ -64,6 +64,7 @@ def test_forms_go_by_their_names():
         LineForm.of('quaternion')
 
 
+@pytest.mark.row(3, 4, 30)
 @pytest.mark.parametrize('form', LineForm)
 @pytest.mark.parametrize('shift', [np.zeros(3), ORIGIN])
 def test_every_form_gives_back_the_line_it_stores(rng, form, shift):
@@ -93,6 +94,7 @@ NEAR = {'general': ((-1.0, 0.3, 4.0), (1.5, -0.4, 6.0)), 'far': ((-300.0, 30.0, 
         'near': ((-0.01, 0.02, 0.1), (0.02, 0.02, 0.12)), 'steep': ((0.02, 0.0, 2.0), (0.3, 0.001, 6.0))}
 
 
+@pytest.mark.row(15)
 @pytest.mark.parametrize('form', LineForm)
 @pytest.mark.parametrize('where', NEAR)
 def test_tangent_is_the_derivative_of_the_move(rng, form, where):
@@ -110,6 +112,10 @@ ODD = {'through the origin': [0.0, 0, 0, 1, 2, 3], 'n parallel to z': [0.0, 0, 2
 ANY_SEGMENT = np.array([[0.0, 0.0], [0.1, 0.0]])
 
 
+@pytest.mark.row(3, 6)
+@pytest.mark.trap('plane z = 0')
+@pytest.mark.trap('line through the origin')
+@pytest.mark.trap('phi across 0 and pi/2')
 @pytest.mark.parametrize('form', FRAMED)
 @pytest.mark.parametrize('L', ODD.values(), ids=ODD)
 def test_forms_without_singularity_hold_and_move_any_line(form, L):
@@ -124,12 +130,16 @@ def test_forms_without_singularity_hold_and_move_any_line(form, L):
         assert np.isfinite(there).all()
 
 
+@pytest.mark.row(4)
+@pytest.mark.trap('plane z = 0')
+@pytest.mark.trap('line through the origin')
 @pytest.mark.parametrize('L', [[0, 0, 0, 1.0, 2, 3], [0.0, 0, 2, 1, 0, 0], [1.0, 0, 0, 0, 0, 0]])
 def test_orth4_refuses_lines_near_its_singularities(L):
     L = np.array(L, float)
     assert not store_line(int(LineForm.ORTH4), L[:3], L[3:], np.eye(3), ANY_SEGMENT, np.empty(VALUES))
 
 
+@pytest.mark.row(4)
 def test_orth4_moved_into_gimbal_lock_is_not_a_number():
     U = so3_exp([0.0, 0.5, 0.0])
     values = np.zeros(VALUES)
@@ -137,6 +147,8 @@ def test_orth4_moved_into_gimbal_lock_is_not_a_number():
     assert np.isnan(moved(LineForm.ORTH4, values, [0.0, np.pi / 2 - 0.5, 0.0, 0.0])).all()
 
 
+@pytest.mark.row(33)
+@pytest.mark.trap('points behind the camera')
 @pytest.mark.parametrize('form', HOSTED)
 def test_host_forms_refuse_a_line_behind_the_camera_or_along_the_ray(rng, form):
     ends = np.array([[-0.1, 0.0], [0.1, 0.0]])
@@ -158,6 +170,7 @@ def test_host_form_keeps_its_plane_and_the_free_one_tilts_it(rng):
     np.testing.assert_allclose(tilted, pinned[:9].reshape(3, 3) @ so3_exp([0.3, -0.2, 0.0]), atol=1e-14)
 
 
+@pytest.mark.row(6, 15, 19)
 def test_compiled_forms_agree_with_the_batched_mathematics(rng):
     values, L = stored(LineForm.ORTHONORMAL, rng)
     U, phi = orthonormal.orthonormal_from_pluecker(L)
@@ -174,6 +187,7 @@ def test_compiled_forms_agree_with_the_batched_mathematics(rng):
     np.testing.assert_allclose(moved(LineForm.ORTH4, values, 0.1 * step)[:4], expected, atol=1e-12)
 
 
+@pytest.mark.row(20, 30)
 def test_compiled_host_form_agrees_with_the_batched_mathematics(rng):
     R_WH, ends_H, L = seen_from(rng, (-1.0, 0.3, 4.0), (1.5, -0.4, 6.0))
     values = np.empty(VALUES)

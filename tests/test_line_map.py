@@ -79,6 +79,9 @@ def clipped(rng):
 A, B = np.array([-1.0, 4.0, 0.2]), np.array([1.0, 4.5, 0.6])
 
 
+@pytest.mark.row(32)
+@pytest.mark.trap('swapped end points')
+@pytest.mark.source_error('D1 section 3')
 @pytest.mark.parametrize('px, tolerance', [(0.0, 1e-9), (1.0, 0.006), (4.5, 0.03)])
 def test_full_views_give_the_ends_however_they_are_ordered(rng, px, tolerance):
     line_map = LineMap(Mapping())
@@ -86,6 +89,9 @@ def test_full_views_give_the_ends_however_they_are_ordered(rng, px, tolerance):
     assert end_error(line_map.segments(), A, B) <= tolerance
 
 
+@pytest.mark.row(32)
+@pytest.mark.trap('partial views')
+@pytest.mark.source_error('D2 updatelineplk')
 @pytest.mark.parametrize('px, tolerance', [(0.0, 0.01), (1.0, 0.02), (4.5, 0.06)])
 def test_clipped_views_give_the_ends_that_few_of_them_reach(rng, px, tolerance):
     line_map = LineMap(Mapping())
@@ -93,6 +99,7 @@ def test_clipped_views_give_the_ends_that_few_of_them_reach(rng, px, tolerance):
     assert end_error(line_map.segments(), A, B) <= tolerance
 
 
+@pytest.mark.row(31)
 def test_the_compiled_foot_is_that_of_the_geometry_module(rng):
     L_W = pluecker_through(A, B)
     for _ in range(20):
@@ -104,12 +111,18 @@ def test_the_compiled_foot_is_that_of_the_geometry_module(rng):
             assert out[0] == pytest.approx((T_WC[:3, :3] @ p_C[k] + T_WC[:3, 3]) @ L_W[3:], abs=1e-9)
 
 
+@pytest.mark.row(32)
+@pytest.mark.trap('one bad frame')
+@pytest.mark.source_error('D2 updatelineplk break')
 def test_one_bad_frame_moves_nothing(rng):
     line_map = LineMap(Mapping())
     add(line_map, rng, 3, A, B, views=10, part=lambda k: (-0.8, 1.9) if k == 4 else (0.0, 1.0))
     assert end_error(line_map.segments(), A, B) < 1e-9
 
 
+@pytest.mark.row(33)
+@pytest.mark.trap('points behind the camera')
+@pytest.mark.trap('near end-on views')
 def test_feet_behind_the_camera_and_along_the_line_are_not_used(rng):
     line_map = LineMap(Mapping())
     add(line_map, rng, 3, A, B, views=8)
@@ -121,6 +134,9 @@ def test_feet_behind_the_camera_and_along_the_line_are_not_used(rng):
     assert end_error(line_map.segments(), A, B) < 1e-9
 
 
+@pytest.mark.row(32)
+@pytest.mark.trap('line longer than 8 m')
+@pytest.mark.source_error('D2 updatelineplk 8 m')
 def test_a_line_of_twelve_metres_is_kept_whole(rng):
     a, b = np.array([-6.0, 7.0, 0.0]), np.array([6.0, 7.0, 0.0])
     line_map = LineMap(Mapping())

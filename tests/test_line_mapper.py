@@ -105,6 +105,9 @@ def test_covariance_tells_the_error(rng):
     assert 0.6 < ratio < 1.4  # sigma is that of the worst direction, the error that of the worse end
 
 
+@pytest.mark.row(32)
+@pytest.mark.trap('one bad frame')
+@pytest.mark.source_error('D2 updatelineplk break')
 def test_one_bad_frame_moves_nothing(rng):
     lines, poses = scene(rng, 10), walk(20)
     frames = [observed(lines, T, rng) for T in poses]
@@ -114,6 +117,9 @@ def test_one_bad_frame_moves_nothing(rng):
     assert len(found) == 10 and across(found.pluecker[:, None], lines[found.ids]).max() < 1e-3
 
 
+@pytest.mark.row(29)
+@pytest.mark.trap('swapped end points')
+@pytest.mark.source_error('D2 triangulate_line')
 def test_swapped_ends_change_nothing(rng):
     lines, poses = scene(rng, 10), walk(12)
     frames = [observed(lines, T, rng) for T in poses]
@@ -126,6 +132,10 @@ def test_swapped_ends_change_nothing(rng):
         assert min(apart, turned_apart) < 1e-6
 
 
+@pytest.mark.row(29)
+@pytest.mark.trap('motion along the line')
+@pytest.mark.trap('motion within the observation plane')
+@pytest.mark.trap('pure rotation')
 @pytest.mark.parametrize('name, direction, motion', [
     ('motion along the line', [1, 0, 0], [1, 0, 0]), ('motion towards the line', [1, 0, 0], [0, 0.0, 1]),
     ('pure rotation', [0, 1, 0], [0, 0, 0])])
@@ -143,6 +153,8 @@ def test_degenerate_motion_waits(rng, name, direction, motion):
     assert across(line_map.segments().pluecker, line).max() < 0.03
 
 
+@pytest.mark.row(33)
+@pytest.mark.trap('points behind the camera')
 def test_a_start_needs_most_feet_in_front(rng):
     lines, poses = scene(rng, 5), walk(10)
     ends = np.stack([observed(lines, T, rng).ends for T in poses], axis=1)

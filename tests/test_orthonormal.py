@@ -30,6 +30,9 @@ def numeric(function, size, h=1e-6):
     return np.stack([(function(h * e) - function(-h * e)) / (2 * h) for e in np.eye(size)], axis=-1)
 
 
+@pytest.mark.row(3)
+@pytest.mark.trap('plane z = 0')
+@pytest.mark.trap('line through the origin')
 @pytest.mark.parametrize('name', LINES)
 def test_round_trip_returns_the_line_also_where_the_frame_is_not_unique(name):
     U, phi = orthonormal.orthonormal_from_pluecker(LINES[name])
@@ -38,6 +41,7 @@ def test_round_trip_returns_the_line_also_where_the_frame_is_not_unique(name):
     np.testing.assert_allclose(orthonormal.pluecker_from_orthonormal(U, phi), normed(LINES[name]), atol=1e-12)
 
 
+@pytest.mark.row(3)
 @repeatable
 @given(vec3, vec3)
 def test_round_trip_of_any_line(p, d):
@@ -61,6 +65,11 @@ def test_a_moment_not_quite_perpendicular_becomes_so():
     np.testing.assert_allclose(found, normed(L), atol=1e-5)
 
 
+def test_six_zeros_are_no_line():
+    U, phi = orthonormal.orthonormal_from_pluecker(np.zeros(6))
+    assert np.isnan(U).any() and np.isnan(orthonormal.pluecker_from_orthonormal(U, phi)).any()
+
+
 def test_batch_axes_are_kept():
     L = np.stack(list(LINES.values()))[:6].reshape(2, 3, 6)
     U, phi = orthonormal.orthonormal_from_pluecker(L)
@@ -73,6 +82,7 @@ def test_batch_axes_are_kept():
                                    orthonormal.jacobian_right(single_U, single_phi), atol=1e-15)
 
 
+@pytest.mark.row(15)
 @pytest.mark.parametrize('name', LINES)
 @pytest.mark.parametrize('side', ['right', 'left'])
 def test_jacobian_is_the_derivative_of_the_update(name, side):
@@ -85,6 +95,8 @@ def test_jacobian_is_the_derivative_of_the_update(name, side):
     np.testing.assert_allclose(jacobian(U, phi), numeric(moved, 4), atol=1e-9)
 
 
+@pytest.mark.row(15)
+@pytest.mark.trap('phi across 0 and pi/2')
 @pytest.mark.parametrize('phi', [-0.3, 0.0, np.pi / 2, 1.9])
 def test_jacobians_hold_beyond_the_usual_range_of_phi(phi):
     U = so3_exp([0.3, -1.0, 2.0])
@@ -94,6 +106,7 @@ def test_jacobians_hold_beyond_the_usual_range_of_phi(phi):
         np.testing.assert_allclose(jacobian(U, phi), found, atol=1e-9)
 
 
+@pytest.mark.row(6)
 def test_left_and_right_updates_are_the_same_motion_seen_from_both_sides():
     U, phi, delta = so3_exp([0.3, -1.0, 2.0]), 0.7, np.array([0.4, -0.2, 0.9, 0.1])
     turned = np.concatenate([U @ delta[:3], delta[3:]])
@@ -101,6 +114,7 @@ def test_left_and_right_updates_are_the_same_motion_seen_from_both_sides():
         np.testing.assert_allclose(left, right, atol=1e-14)
 
 
+@pytest.mark.row(6)
 def test_a_thousand_updates_stay_in_so3():
     steps = 0.5 * np.random.default_rng(0).normal(size=(1000, 4))
     U, phi = orthonormal.orthonormal_from_pluecker(LINES['general'])
@@ -110,6 +124,18 @@ def test_a_thousand_updates_stay_in_so3():
     assert np.linalg.det(U) == pytest.approx(1)
 
 
+@pytest.mark.row(6)
+def test_a_thousand_left_updates_stay_in_so3():
+    steps = 0.5 * np.random.default_rng(1).normal(size=(1000, 4))
+    U, phi = orthonormal.orthonormal_from_pluecker(LINES['general'])
+    for delta in steps:
+        U, phi = orthonormal.plus_left(U, phi, delta)
+    np.testing.assert_allclose(U.T @ U, np.eye(3), atol=3e-15)
+    assert np.linalg.det(U) == pytest.approx(1)
+
+
+@pytest.mark.row(6)
+@pytest.mark.trap('phi across 0 and pi/2')
 @pytest.mark.parametrize('start', [0.0, np.pi / 2])
 def test_phi_passes_zero_and_a_right_angle_without_a_fold(start):
     U = so3_exp([0.3, -1.0, 2.0])
@@ -118,6 +144,7 @@ def test_phi_passes_zero_and_a_right_angle_without_a_fold(start):
     assert np.linalg.norm(after - before) == pytest.approx(2e-4, rel=1e-6)
 
 
+@pytest.mark.row(4)
 @pytest.mark.parametrize('name', ['general', 'along z'])
 def test_euler_form_round_trip(name):
     orth4 = orthonormal.orth4_from_pluecker(LINES[name])
@@ -125,6 +152,7 @@ def test_euler_form_round_trip(name):
     np.testing.assert_allclose(found, normed(LINES[name]), atol=1e-12)
 
 
+@pytest.mark.row(5)
 def test_point_and_direction_survive_the_euler_form():
     p, d = np.array([1.0, 2.0, 3.0]), np.array([0.6, 0.0, -0.8])
     orth4 = orthonormal.orth4_from_pluecker(lines.line_through(p, d))
@@ -133,6 +161,9 @@ def test_point_and_direction_survive_the_euler_form():
     np.testing.assert_allclose(lines.closest_point(L, p), p, atol=1e-13)
 
 
+@pytest.mark.row(4)
+@pytest.mark.trap('plane z = 0')
+@pytest.mark.trap('line through the origin')
 @pytest.mark.parametrize('name, message', [('in the plane z = 0', 'parallel to z'), ('through the origin', 'origin'),
                                            ('nearly through the origin', 'origin'), ('at infinity', 'infinity')])
 def test_euler_form_raises_where_it_cannot_hold_the_line(name, message):
@@ -140,6 +171,7 @@ def test_euler_form_raises_where_it_cannot_hold_the_line(name, message):
         orthonormal.orth4_from_pluecker(LINES[name])
 
 
+@pytest.mark.row(19)
 def test_euler_form_takes_the_same_right_update_as_the_frame():
     orth4, delta = np.array([0.3, -0.9, 2.0, 0.6]), np.array([0.2, 0.1, -0.3, 0.05])
     expected = orthonormal.plus_right(*orthonormal.orthonormal_from_orth4(orth4), delta)
@@ -148,6 +180,7 @@ def test_euler_form_takes_the_same_right_update_as_the_frame():
         np.testing.assert_allclose(part, wanted, atol=1e-14)
 
 
+@pytest.mark.row(19)
 @pytest.mark.parametrize('ay', [0.0, 1.0, -1.5])
 def test_ambient_jacobian_of_the_euler_form_is_the_derivative_of_its_update(ay):
     orth4 = np.array([0.3, ay, 1.0, 0.6])
@@ -155,6 +188,7 @@ def test_ambient_jacobian_of_the_euler_form_is_the_derivative_of_its_update(ay):
     np.testing.assert_allclose(orthonormal.orth4_plus_jacobian(orth4), found, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.row(19)
 def test_ambient_and_tangent_jacobians_chain_to_the_same_derivative():
     """d L / d orth4 times d orth4 / d delta is d L / d delta: the two kinds are not interchangeable."""
     orth4 = np.array([0.3, -0.9, 2.0, 0.6])
@@ -165,6 +199,7 @@ def test_ambient_and_tangent_jacobians_chain_to_the_same_derivative():
     assert np.abs(ambient - tangent).max() > 0.1
 
 
+@pytest.mark.row(4, 19)
 def test_euler_form_raises_at_gimbal_lock():
     with pytest.raises(ValueError, match='gimbal'):
         orthonormal.orth4_plus_jacobian([0.3, np.pi / 2, 1.0, 0.6])

@@ -5,8 +5,10 @@ import argparse
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from types import ModuleType
 
-COMMANDS = ('replay', 'play', 'convert', 'evaluate')  # modules of this room, light to import
+# modules of this room, light to import
+COMMANDS = ('replay', 'play', 'convert', 'evaluate', 'simulate', 'optimize-lines')
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -16,15 +18,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog='line_slam', description='Point-line visual-inertial SLAM for ROS 2.')
     subparsers = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
     for name in wanted:
-        import_module(f'line_slam_ros.cli.{name}').add_parser(subparsers)
+        _module_of(name).add_parser(subparsers)
     args = parser.parse_args(argv)
     try:
-        return import_module(f'line_slam_ros.cli.{args.command}').run(args)
+        return _module_of(args.command).run(args)
     except (ValueError, OSError) as error:
         print(f'line_slam {args.command}: {error}', file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130
+
+
+def _module_of(command: str) -> ModuleType:
+    return import_module(f'line_slam_ros.cli.{command.replace("-", "_")}')
 
 
 if __name__ == '__main__':

@@ -58,7 +58,7 @@ def fit_line(form, loss, c2, poses, ends, sigma, values, origin, iterations, tol
         gain, cost, damping = cost - new_cost, new_cost, max(0.1 * damping, LEAST_DAMPING)
         values[:], taken = moved, taken + 1
         H, new_H, g, new_g = new_H, H, new_g, g
-        if gain <= tolerance * cost:
+        if gain < tolerance * cost:
             break
     return cost, taken
 
@@ -87,7 +87,7 @@ def _fit_jointly(form, loss, c2, first, last, poses, ends, sigma, values, origin
             continue
         values[:], cost[:] = moved, new_cost
         at, damping, taken = 1 - at, max(0.1 * damping, LEAST_DAMPING), taken + 1
-        if gain <= tolerance * cost.sum():
+        if gain < tolerance * cost.sum():
             break
     steps[:] = taken
 

@@ -57,7 +57,8 @@ def jacobian(rho_theta: ArrayLike, R_HL: ArrayLike) -> F64:
 def plus(rho_theta: ArrayLike, delta: ArrayLike) -> F64:
     """rho_theta + delta (..., 2) with theta wrapped into [-pi, pi)."""
     rho, theta = np.moveaxis(np.add(rho_theta, delta), -1, 0)
-    return np.stack([rho, (theta + np.pi) % (2.0 * np.pi) - np.pi], axis=-1)
+    wrapped = (theta + np.pi) % (2.0 * np.pi) - np.pi
+    return np.stack([rho, np.where(wrapped < np.pi, wrapped, -np.pi)], axis=-1)  # rounding may end at pi
 
 
 def _parts(rho_theta: ArrayLike) -> tuple[F64, F64, F64]:

@@ -61,7 +61,8 @@ def move_line(form, values, step, out):
             turn[0], turn[1], turn[2] = step[2], step[3], 0.0
             retract_rotation(U, turn, U)
         _write(U, out)
-        out[9] = (theta + np.pi) % (2.0 * np.pi) - np.pi
+        wrapped = (theta + np.pi) % (2.0 * np.pi) - np.pi
+        out[9] = wrapped if wrapped < np.pi else -np.pi  # rounding may end at pi
         out[10] = max(rho, 0.2 * values[10], 1.0 / FURTHEST)  # nearer to infinity by a factor of five at most
         return
     phi = _frame_of(form, values, U)

@@ -126,10 +126,10 @@ def plane_cosine(P_1: ArrayLike, P_2: ArrayLike) -> F64:
 
 
 def widest_pair(planes: ArrayLike) -> tuple[int, int, float]:
-    """The two of (N, 4) unit planes that cross at the largest angle, and their plane_cosine."""
-    planes = np.asarray(planes, float)
-    cosine = plane_cosine(planes[:, None], planes[None])
-    i, j = divmod(int(np.argmin(cosine)), len(planes))
+    """The two of (N, 4) unit planes that cross at the largest angle, and their plane_cosine; NaN planes cross none."""
+    normals = np.asarray(planes, float)[:, :3]
+    cosine = np.nan_to_num(np.abs(normals @ normals.T), nan=1.0)
+    i, j = divmod(int(np.argmin(cosine)), len(normals))
     return min(i, j), max(i, j), float(cosine[i, j])
 
 
@@ -148,10 +148,10 @@ def line_from_many_planes(planes: ArrayLike) -> F64:
     """Line (..., 6), |d| = 1, nearest to all of (..., N, 4) unit planes in the algebraic sense; N >= 2.
 
     The null space of the stacked planes holds the points of the line (Hartley, Zisserman, section 12.7). Rows of zeros
-    do not count, so that lines with different numbers of views fit one array. NaN when all planes coincide. Give the
-    planes in a frame near the cameras, a weight on a row is its importance.
+    or NaN do not count, so that lines with different numbers of views fit one array. NaN when all planes coincide.
+    Give the planes in a frame near the cameras, a weight on a row is its importance.
     """
-    _, singular, Vt = np.linalg.svd(np.asarray(planes, float))
+    _, singular, Vt = np.linalg.svd(np.nan_to_num(planes))
     (x_1, w_1), (x_2, w_2) = ((Vt[..., k, :3], Vt[..., k, 3:]) for k in (2, 3))
     L = np.concatenate([np.cross(x_1, x_2), w_1 * x_2 - w_2 * x_1], axis=-1)
     return unit_direction(np.where(singular[..., 1:2] > COINCIDENT * singular[..., :1], L, np.nan))

@@ -29,9 +29,10 @@ def orthonormal_from_pluecker(L: ArrayLike) -> tuple[F64, F64]:
     L = np.asarray(L, float)
     n, d = L[..., :3], L[..., 3:]
     n_length, d_length = (np.linalg.norm(v, axis=-1, keepdims=True) for v in (n, d))
-    first = n_length >= d_length
-    u_long = np.where(first, n, d) / np.maximum(n_length, d_length)
-    u_short = _perpendicular(np.where(first, d, n) / np.maximum(n_length, d_length), u_long)
+    first, longer = n_length >= d_length, np.maximum(n_length, d_length)
+    longer = np.where(longer > 0.0, longer, np.nan)  # six zeros are no line
+    u_long = np.where(first, n, d) / longer
+    u_short = _perpendicular(np.where(first, d, n) / longer, u_long)
     u_1, u_2 = np.where(first, u_long, u_short), np.where(first, u_short, u_long)
     return np.stack([u_1, u_2, np.cross(u_1, u_2)], axis=-1), np.arctan2(d_length, n_length)[..., 0]
 

@@ -1,0 +1,1 @@
+"""The line experiment on files: known poses, true segments and what a camera saw of them."""

@@ -1,0 +1,85 @@
+"""Methods against noise: the same problem, disturbed again and again by seed, solved by each method."""
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+
+import numpy as np
+
+from line_slam_ros.experiment.files import Experiment, add_noise
+from line_slam_ros.experiment.methods import Method
+from line_slam_ros.experiment.problem import LineProblem
+from line_slam_ros.experiment.score import score
+from line_slam_ros.experiment.solving import Result, fit, solve_lines, store
+from line_slam_ros.experiment.starts import start_lines
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One method on one noisy copy of the views."""
+
+    noise_px: float
+    seed: int
+    method: str
+    lines: int
+    failures: int
+    outliers: int  # views that do not count
+    cost: float
+    sigma_px: float  # that weighed the residuals
+    iterations: int
+    start_s: float
+    solve_s: float
+    angle_deg_mean: float
+    angle_deg_max: float
+    perpendicular_m_mean: float
+    perpendicular_m_max: float
+    endpoint_m_mean: float
+    endpoint_m_max: float
+
+
+def disturbed(experiment: Experiment, noise_px: float, seed: int, focal: float) -> LineProblem:
+    """The problem with noise of so many pixels on its views."""
+    return LineProblem.of(replace(experiment, views=add_noise(experiment.views, noise_px / focal, seed)))
+
+
+def sweep(experiment: Experiment, methods: Mapping[str, Method], noise_px: Sequence[float],
+          seeds: Sequence[int]) -> list[Run]:
+    """Every method, by its name, at every noise level and seed; without noise all seeds are one."""
+    runs = []
+    for level in noise_px:
+        for seed in seeds if level > 0.0 else seeds[:1]:
+            for name, method in methods.items():
+                problem = disturbed(experiment, level, seed, method.focal)
+                runs.append(summarise(problem, solve_lines(problem, method), name, level, seed))
+    return runs
+
+
+def summarise(problem: LineProblem, result: Result, method: str, noise_px: float, seed: int) -> Run:
+    """The figures of one result."""
+    errors = score(problem.segments, result.pluecker, result.ends).summary()
+    return Run(noise_px, seed, method, len(result.reason), int(np.sum(~result.ok)), int(result.outliers.sum()),
+               result.total_cost, result.sigma_px, result.iterations, result.start_s, result.solve_s, **errors)
+
+
+def means(runs: Sequence[Run]) -> list[Run]:
+    """One row per noise level and method: the mean over its seeds, the maximum of the maxima; seed is their number."""
+    groups: dict[tuple[float, str], list[Run]] = {}
+    for run in runs:
+        groups.setdefault((run.noise_px, run.method), []).append(run)
+    return [_mean(group) for group in groups.values()]
+
+
+def _mean(group: list[Run]) -> Run:
+    row = asdict(group[0])
+    for name in (f.name for f in fields(Run) if f.name not in ('noise_px', 'method', 'lines')):
+        values = [getattr(run, name) for run in group]
+        row[name] = max(values) if name.endswith('_max') else float(np.mean(values))
+    return Run(**{**row, 'seed': len(group)})
+
+
+def time_joint(problem: LineProblem, method: Method, iterations: int = 10, repeats: int = 3) -> float:
+    """Wall seconds of so many joint iterations on all lines that can be started, kernels warm; the best of repeats."""
+    method = replace(method, joint=True, iterations=iterations, tolerance=0.0, gate=None,
+                     sigma_px=method.sigma_px or 1.0)
+    rows, values, _ = store(problem, method, start_lines(problem, method.start, method.min_parallax_deg))
+    return min(fit(problem, method, rows, values.copy()).seconds for _ in range(repeats))
