@@ -22,12 +22,12 @@ _ROS_OWN = ('use_sim_time', 'qos_overrides', 'start_type_description_service')  
 _SECTIONS = ('/**', f'/**/{NODE_NAME}', NODE_NAME, f'/{NODE_NAME}')  # later ones win
 
 
-def load(paths: Iterable[Path | str] = (), settings: Iterable[str] = ()) -> tuple[Config, ShellConfig]:
-    """Defaults, then the files in order, then ``name=value`` settings; ValueError names file, key and remedy."""
+def load(paths: Iterable[Path | str] = (), given: Iterable[str] = ()) -> tuple[Config, ShellConfig]:
+    """Defaults, then the files in order, then ``name=value`` texts; ValueError names file, key and remedy."""
     config, shell = Config(), ShellConfig()
     for path in paths:
         config, shell = apply(config, shell, read(path), str(path))
-    return apply(config, shell, dict(map(_setting, settings)), '--set')
+    return apply(config, shell, settings(given, '--set'), '--set')
 
 
 def apply(config: Config, shell: ShellConfig, values: Mapping[str, Any], origin: str) -> tuple[Config, ShellConfig]:
@@ -73,14 +73,19 @@ def _flat(tree: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
     return flat
 
 
-def _setting(text: str) -> tuple[str, Any]:
+def settings(texts: Iterable[str], option: str) -> dict[str, Any]:
+    """Name -> value of ``name=value`` texts, values in YAML; ValueError names the option they were given with."""
+    return dict(_setting(text, option) for text in texts)
+
+
+def _setting(text: str, option: str) -> tuple[str, Any]:
     name, equals, value = text.partition('=')
     if not equals:
-        raise ValueError(f'--set {text}: expected name=value')
+        raise ValueError(f'{option} {text}: expected name=value')
     try:
         return name.strip(), yaml.safe_load(value)
     except yaml.YAMLError:
-        raise ValueError(f'--set {text}: the value is not readable as YAML') from None
+        raise ValueError(f'{option} {text}: the value is not readable as YAML') from None
 
 
 def _typed(leaf: Field, value: Any) -> Any:

@@ -2,11 +2,15 @@
 from __future__ import annotations
 
 import copy
+import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from evo.core import metrics, sync
+from evo.core.filters import FilterException
 from evo.core.geometry import GeometryException
 from evo.core.metrics import PoseRelation
 from evo.core.trajectory import PoseTrajectory3D
@@ -47,6 +51,8 @@ class TrajectoryScore:
     rotation_max_deg: float
     rpe_1s_translation_rmse_m: float  # NaN when shorter than a second
     rpe_1s_rotation_rmse_deg: float
+    rpe_10pct_translation_rmse_m: float  # over a tenth of the true path; NaN without such a pair
+    rpe_10pct_rotation_rmse_deg: float
     scale: float  # factor on the estimate that fits the truth best (Sim(3) alignment)
     still: Drift | None
 
@@ -62,6 +68,11 @@ def read_trajectory(path: str | Path) -> PoseTrajectory3D:
     if trajectory.num_poses < 3:
         raise ValueError(f'{path}: {trajectory.num_poses} poses, at least 3 are needed')
     return trajectory
+
+
+def trajectory(stamps: F64, T_WB: F64) -> PoseTrajectory3D:
+    """Poses (N, 4, 4) at stamps (N,) s as evo wants them."""
+    return PoseTrajectory3D(timestamps=stamps, poses_se3=list(T_WB))
 
 
 def score_trajectory(estimate: PoseTrajectory3D, truth: PoseTrajectory3D) -> tuple[TrajectoryScore, F64]:
@@ -81,6 +92,8 @@ def score_trajectory(estimate: PoseTrajectory3D, truth: PoseTrajectory3D) -> tup
         position['mean'], position['max'], rotation['rmse'], rotation['max'],
         relative_error(true, aligned, PoseRelation.translation_part),
         relative_error(true, aligned, PoseRelation.rotation_angle_deg),
+        relative_error_over_path(true, aligned, PoseRelation.translation_part),
+        relative_error_over_path(true, aligned, PoseRelation.rotation_angle_deg),
         float(scale), still_drift(stamps, true.positions_xyz, aligned.positions_xyz))
     return result, rigid(R_TE, p_TE)
 
@@ -96,6 +109,18 @@ def relative_error(true: PoseTrajectory3D, aligned: PoseTrajectory3D, relation: 
     last = np.array(rpe.delta_ids)
     whole = np.abs(stamps[last] - stamps[last - delta] - 1.0) < 0.1  # not across a gap
     return float(np.sqrt(np.mean(rpe.error[whole] ** 2))) if np.any(whole) else float('nan')
+
+
+def relative_error_over_path(true: PoseTrajectory3D, aligned: PoseTrajectory3D, relation: PoseRelation,
+                             share: float = 0.1) -> float:
+    """RMSE of evo's relative pose error over all pairs that share of the true path apart (within a tenth of it)."""
+    delta = share * float(true.path_length)
+    rpe = metrics.RPE(relation, delta, metrics.Unit.meters, all_pairs=True, pairs_from_reference=True)
+    try:
+        rpe.process_data((true, aligned))
+    except FilterException:  # no such pair
+        return float('nan')
+    return float(rpe.get_statistic(metrics.StatisticsType.rmse))
 
 
 def still_drift(stamps: F64, true: F64, aligned: F64) -> Drift | None:
@@ -131,6 +156,19 @@ def score_lines(path: str | Path, true_lines: F64, T_TE: F64) -> LineScore:
     except OSError as error:
         raise ValueError(f'{path}: {error.strerror}') from None
     return score(transform_points(T_TE, lines.ends), true_lines)
+
+
+def json_text(value: Any) -> str:
+    """JSON, with null for NaN, which JSON does not have."""
+    return json.dumps(_without_nan(value), indent=2) + '\n'
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _without_nan(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def _statistics(metric: metrics.APE, true: PoseTrajectory3D, aligned: PoseTrajectory3D) -> dict[str, float]:

@@ -61,7 +61,7 @@ def test_a_perfect_result_in_another_world_has_no_error(results, capsys):
     result = evaluated(results())
     trajectory = result['trajectory']
     assert trajectory['matched'] == trajectory['poses'] == 300
-    for name in ('ate_rmse_m', 'ate_max_m', 'rpe_1s_translation_rmse_m'):
+    for name in ('ate_rmse_m', 'ate_max_m', 'rpe_1s_translation_rmse_m', 'rpe_10pct_translation_rmse_m'):
         assert trajectory[name] < 1e-6, name
     assert trajectory['rotation_max_deg'] < 1e-4 and trajectory['scale'] == pytest.approx(1.0, abs=1e-6)
     assert trajectory['still']['drift_m'] < 1e-6 and trajectory['still']['duration_s'] == pytest.approx(5, abs=0.6)
@@ -91,6 +91,23 @@ def test_relative_error_leaves_out_pairs_across_a_gap(results):
     frames = np.r_[0:100, 140:300]
     trajectory = evaluated(results(jump, frames=frames))['trajectory']
     assert trajectory['rpe_1s_translation_rmse_m'] < 1e-6 and trajectory['ate_max_m'] > 0.2
+
+
+def test_relative_error_over_a_tenth_of_the_path_grows_with_the_path(results):
+    """A scale error of 2 % is 2 % of the distance between the ends of any stretch, which is at most its length."""
+    def swollen(poses):
+        poses = poses.copy()
+        poses[:, :3, 3] *= 1.02
+        return poses
+    trajectory = evaluated(results(swollen))['trajectory']
+    stretch = 0.1 * trajectory['length_m']
+    assert 0.85 * 0.02 * stretch < trajectory['rpe_10pct_translation_rmse_m'] < 1.1 * 0.02 * stretch
+    assert trajectory['rpe_10pct_rotation_rmse_deg'] < 1e-4
+
+
+def test_relative_error_over_path_is_not_known_from_few_poses(results):
+    trajectory = evaluated(results(frames=[0, 50, 110, 170]))['trajectory']
+    assert trajectory['matched'] == 4 and trajectory['rpe_10pct_translation_rmse_m'] is None
 
 
 def test_an_empty_map_has_null_precision(results):

@@ -2,8 +2,6 @@
 from __future__ import annotations
 
 import argparse
-import json
-import math
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -39,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
         print(f'line_slam evaluate: {error}', file=sys.stderr)
         return 1
     path = args.result_dir / 'evaluation.json'
-    path.write_text(json.dumps(_without_nan(result), indent=2) + '\n', encoding='utf-8')
+    path.write_text(evaluation.json_text(result), encoding='utf-8')
     print('\n'.join(table(result)))
     return 0
 
@@ -50,11 +48,15 @@ def table(result: dict[str, Any]) -> list[str]:
     rows = [('poses matched', f'{t["matched"]} of {t["poses"]}, {t["duration_s"]:.1f} s, {t["length_m"]:.2f} m'),
             ('ATE', f'{t["ate_rmse_m"]:.4f} m rmse, {t["ate_mean_m"]:.4f} mean, {t["ate_max_m"]:.4f} max'),
             ('rotation', f'{t["rotation_rmse_deg"]:.3f} deg rmse, {t["rotation_max_deg"]:.3f} max'),
-            ('RPE over 1 s', f'{t["rpe_1s_translation_rmse_m"]:.4f} m, {t["rpe_1s_rotation_rmse_deg"]:.3f} deg rmse'),
+            ('RPE over 1 s', _relative(t, 'rpe_1s')), ('RPE over 10 %', f'{_relative(t, "rpe_10pct")} (of the path)'),
             ('scale', f'{t["scale"]:.5f} (factor that fits the truth)')]
     if t['still'] is not None:
         rows.append(('drift at rest', f'{t["still"]["drift_m"]:.4f} m over {t["still"]["duration_s"]:.1f} s'))
     return [f'{name:<16}{figure}' for name, figure in rows + _line_rows(result.get('lines'))]
+
+
+def _relative(t: dict[str, Any], name: str) -> str:
+    return f'{t[f"{name}_translation_rmse_m"]:.4f} m, {t[f"{name}_rotation_rmse_deg"]:.3f} deg rmse'
 
 
 def _line_rows(lines: dict[str, Any] | None) -> list[tuple[str, str]]:
@@ -66,12 +68,3 @@ def _line_rows(lines: dict[str, Any] | None) -> list[tuple[str, str]]:
         figures = f'precision {100 * precision:.1f} %, recall {100 * recall:.1f} % ({metres:.1f} m)'
         rows.append((f'within {100 * t:g} cm', figures))
     return rows
-
-
-def _without_nan(value: Any) -> Any:
-    """JSON has no NaN: null instead."""
-    if isinstance(value, dict):
-        return {name: _without_nan(item) for name, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(item) for item in value]
-    return None if isinstance(value, float) and math.isnan(value) else value

@@ -8,7 +8,7 @@ from importlib import import_module
 from types import ModuleType
 
 # modules of this room, light to import
-COMMANDS = ('replay', 'play', 'convert', 'evaluate', 'simulate', 'optimize-lines')
+COMMANDS = ('replay', 'play', 'convert', 'evaluate', 'simulate', 'optimize-lines', 'benchmark')
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -20,6 +20,11 @@ def add_parser(subparsers: Any) -> None:
                         help='camchain-imucam.yaml; default: calibration_file of the parameters, calibration.yaml in '
                              'the bag directory or beside it, camera_info with T_body_camera')
     parser.add_argument('--threads', type=int, default=1, help='threads that OpenCV may use')
+    parser.add_argument('--start', type=float, default=0.0, metavar='S', help='skip this much after the first image, s')
+    parser.add_argument('--duration', type=float, metavar='S', help='use no more than this much; default: all of it, s')
+    parser.add_argument('--degrade', action='append', default=[], metavar='NAME=VALUE',
+                        help='make the recording worse, to see what it takes: every_nth=2, imu_noise=3, ... '
+                             '(line_slam benchmark recordings --help has all of them)')
     parser.add_argument('--no-figure', dest='figure', action='store_false', help='do not draw figure.png')
     for name, what in (('image', 'raw or compressed images'), ('imu', 'sensor_msgs/Imu'),
                        ('camera-info', 'sensor_msgs/CameraInfo'), ('pose', 'poses, with pose_source: topic')):

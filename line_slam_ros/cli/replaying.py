@@ -4,21 +4,22 @@ from __future__ import annotations
 import argparse
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 from tqdm import tqdm
 
+from line_slam_ros.benchmark.degrade import Degradation, DegradedStream, degraded_calibration
 from line_slam_ros.cli.bag_calibration import find_calibration, with_calibration_beside
 from line_slam_ros.cli.bag_reader import Bag, open_bag
 from line_slam_ros.cli.bag_topics import Topics, choose_topics
 from line_slam_ros.cli.results import Results, settings_of
 from line_slam_ros.config import Config
-from line_slam_ros.config_file import load
+from line_slam_ros.config_file import load, settings
 from line_slam_ros.estimation.line_mapper import LineMapper
 from line_slam_ros.inbox import Inbox, PoseInbox
 from line_slam_ros.shell_config import ShellConfig
@@ -35,6 +36,7 @@ def replay(args: argparse.Namespace) -> int:
     config, shell = load(args.config, args.set)
     if args.calibration:
         shell = replace(shell, calibration_file=str(args.calibration))
+    wanted = Degradation.of(settings(args.degrade, '--degrade'), '--degrade')
     cv2.setRNGSeed(0)
     cv2.setNumThreads(args.threads)
     with open_bag(args.bag) as bag:
@@ -44,11 +46,37 @@ def replay(args: argparse.Namespace) -> int:
         calibration, calibration_note = find_calibration(bag, topics, shell)
         for note in filter(None, (bag.note, *topics.notes, calibration_note)):
             _tell(note)
-        run = (PoseRun if shell.pose_source == 'topic' else ImuRun)(config, shell, calibration, topics)
+        stream = DegradedStream(wanted, calibration.imu_noise)
+        calibration = degraded_calibration(calibration, wanted)
+        run = (PoseRun if shell.pose_source == 'topic' else ImuRun)(config, shell, calibration, topics, stream)
         run.slam.warm_up()
-        with Results(args.output, shell, settings_of(config, shell), run.slam, run.inbox, args.figure) as results:
-            _run_through(bag, topics, run, results)
+        record = settings_of(config, shell) | {f'degrade.{name}': v for name, v in wanted.changes().items()}
+        with Results(args.output, shell, record, run.slam, run.inbox, args.figure) as results:
+            _run_through(bag, Clip(topics.image, args.start, args.duration), topics, run, results)
     return _conclude(args.output, results)
+
+
+@dataclass(frozen=True)
+class Clip:
+    """The part of a recording that is used, by the stamps of its images."""
+
+    image_topic: str
+    start_s: float  # since the first image
+    duration_s: float | None  # None: to the end
+
+    def of(self, messages: Iterable[tuple[str, Any]]) -> Iterator[tuple[str, Any]]:
+        """The messages but for the images before the start; ends at the first image past the end."""
+        first: int | None = None
+        for topic, message in messages:
+            if topic == self.image_topic:
+                t_ns = sensors.stamp_ns(message)
+                first = t_ns if first is None else first
+                since_start_s = (t_ns - first) * 1e-9 - self.start_s
+                if self.duration_s is not None and since_start_s > self.duration_s:
+                    return
+                if since_start_s < 0.0 < self.start_s:
+                    continue
+            yield topic, message
 
 
 class Run(ABC):
@@ -57,15 +85,17 @@ class Run(ABC):
     slam: Slam | LineMapper
     inbox: Inbox | PoseInbox
 
-    def __init__(self, topics: Topics) -> None:
-        self._topics = topics
+    def __init__(self, topics: Topics, stream: DegradedStream) -> None:
+        self._topics, self._stream = topics, stream
         self._to_frame = sensors.compressed_to_frame if topics.compressed else sensors.image_to_frame
 
     def feed(self, topic: str, message: Any) -> None:
         """A message of the bag; one that cannot be used is counted and told."""
         try:
             if topic == self._topics.image:
-                self.inbox.frame(self._to_frame(message))
+                frame = self._stream.frame(self._to_frame(message))
+                if frame is not None:
+                    self.inbox.frame(frame)
             else:
                 self._motion(message)
         except ValueError as error:
@@ -94,14 +124,15 @@ class Run(ABC):
 class ImuRun(Run):
     """Poses estimated from images and inertial data."""
 
-    def __init__(self, config: Config, shell: ShellConfig, calibration: Calibration, topics: Topics) -> None:
-        super().__init__(topics)
+    def __init__(self, config: Config, shell: ShellConfig, calibration: Calibration, topics: Topics,
+                 stream: DegradedStream) -> None:
+        super().__init__(topics, stream)
         self.slam = Slam(config, calibration)
         self.inbox = Inbox(_WAITING, calibration.time_offset, (calibration.width, calibration.height),
                            shell.accel_scale, _IMU_CAPACITY)
 
     def _motion(self, message: Any) -> None:
-        self.inbox.imu(*sensors.imu_fields(message))
+        self.inbox.imu(*self._stream.imu(*sensors.imu_fields(message)))
 
     def _process(self, frame: Frame, imu: ImuBatch) -> tuple[Frame, ImuBatch | None, Estimate | None]:
         return frame, imu, self.slam.process(frame, imu)
@@ -110,8 +141,9 @@ class ImuRun(Run):
 class PoseRun(Run):
     """Poses taken from a topic; only lines are mapped."""
 
-    def __init__(self, config: Config, shell: ShellConfig, calibration: Calibration, topics: Topics) -> None:
-        super().__init__(topics)
+    def __init__(self, config: Config, shell: ShellConfig, calibration: Calibration, topics: Topics,
+                 stream: DegradedStream) -> None:
+        super().__init__(topics, stream)
         self.slam = LineMapper(config, calibration)
         self.inbox = PoseInbox(_WAITING, calibration.time_offset, (calibration.width, calibration.height))
 
@@ -122,12 +154,12 @@ class PoseRun(Run):
         return frame, None, self.slam.process_with_pose(frame, T_WB)
 
 
-def _run_through(bag: Bag, topics: Topics, run: Run, results: Results) -> None:
+def _run_through(bag: Bag, clip: Clip, topics: Topics, run: Run, results: Results) -> None:
     """The whole bag through the SLAM, with a progress bar and the inbox's remarks."""
     wanted = (topics.image, topics.motion)
     total = sum(bag.counts[topic] for topic in wanted)
     with closing(tqdm(total=total, unit='msg', desc='replay', dynamic_ncols=True, mininterval=0.5)) as progress:
-        for topic, message in bag.messages(wanted):
+        for topic, message in clip.of(bag.messages(wanted)):
             progress.update()
             run.feed(topic, message)
             _collect(run, results)
