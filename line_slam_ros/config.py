@@ -75,6 +75,10 @@ class Estimator(Checked):
     gravity: float = param(9.81, 'magnitude of gravity, m/s^2', 9.0, 10.0)
     gyro_bias_sigma: float = param(0.05, 'uncertainty of the initial gyro bias, rad/s', 1e-5, 1.0)
     accel_bias_sigma: float = param(0.2, 'uncertainty of the initial accelerometer bias (mean 0), m/s^2', 1e-4, 5.0)
+    extrinsic_sigma_deg: float = param(0.5, 'how well the rotation between camera and IMU is calibrated (standard '
+                                       'deviation); it is refined, but with 0, deg', 0.0, 10.0)
+    extrinsic_sigma_m: float = param(0.005, 'the same of the position of the camera in the body, m', 0.0, 0.5)
+    time_offset_sigma_s: float = param(0.003, 'the same of the time offset of the images, s', 0.0, 0.1)
     init_window_s: float = param(2.0, 'longest stretch of images that a start from motion uses, s', 0.5, 10.0)
     init_max_scale_sigma: float = param(0.05, 'relative uncertainty of scale at which a start is accepted', 0.001, 1.0)
     keyframe_max_s: float = param(1.0, 'longest time between keyframes while moving, s', 0.1, 10.0)
@@ -87,7 +91,7 @@ class Mapping(Checked):
     """What enters the line map."""
 
     min_views: int = param(4, 'keyframes that must have seen a line', 2, 1000)
-    max_sigma_m: float = param(0.02, 'largest standard deviation across the line at its ends, m', 1e-4, 10.0)
+    max_sigma_m: float = param(0.012, 'largest standard deviation across the line at its ends, m', 1e-4, 10.0)
     min_parallax_deg: float = param(1.0, 'smallest angle about the line between its extreme views, deg', 0.0, 90.0)
     min_length_m: float = param(0.05, 'shorter lines are not kept, m', 0.0, 10.0)
     max_range_m: float = param(50.0, 'ends further from the camera than this are not used, m', 0.5, 1e4)

@@ -25,6 +25,7 @@ from line_slam_ros.types import (
     ImuBatch,
     LineSegments,
     Observations,
+    RigCorrection,
     Samples,
     Status,
 )
@@ -107,6 +108,10 @@ class Slam:
         self.line_map.clear()
         self._last_ns = None
 
+    def rig(self) -> RigCorrection:
+        """How far the calibration of camera and IMU was refined."""
+        return self.estimator.rig()
+
     def active_lines(self) -> LineSegments:
         """The lines the window sees now."""
         return self.line_map.active()
@@ -147,7 +152,7 @@ class Slam:
         R_BpBn = np.eye(3)
         for R in so3_exp(steps):
             R_BpBn = R_BpBn @ R
-        R_BC = self.calibration.T_BC[:3, :3]
+        R_BC = self.estimator.window.R_BC
         return R_BC.T @ R_BpBn.T @ R_BC
 
     def _map(self) -> None:

@@ -96,6 +96,15 @@ class Observations:
     lines: LineObservations
 
 
+@dataclass(frozen=True, slots=True)
+class RigCorrection:
+    """What the estimator changed of the calibration of camera and IMU."""
+
+    rotation_deg: float  # angle between the calibrated and the present R_BC
+    shift_m: float  # between the calibrated and the present p_BC
+    delay_s: float  # images were taken that much later than stamped
+
+
 class Status(Enum):
     """What the estimator is doing."""
 

@@ -11,7 +11,7 @@ from line_slam_ros.estimation.initialisation import upright
 from line_slam_ros.estimation.marginalisation import eliminate
 from line_slam_ros.estimation.stillness import Stillness
 from line_slam_ros.geometry.imu import between
-from line_slam_ros.geometry.lie import so3_exp
+from line_slam_ros.geometry.lie import rigid, so3_exp, so3_log
 from line_slam_ros.simulation.features import GRAVITY_W, Room, Sequence, Trajectory, calibration
 from line_slam_ros.types import LINE_FORMS, LineObservations, PointObservations
 
@@ -19,10 +19,11 @@ NO_LINES = LineObservations(np.empty(0, np.int64), np.empty((0, 2, 2)), np.empty
 NO_POINTS = PointObservations(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2)))
 
 
-def run(sequence, options=None, change=lambda k, seen: seen):
+def run(sequence, options=None, change=lambda k, seen: seen, given=None):
     """Feeds a sequence; returns the estimator, times (s) and positions (N, 3), covariances of position, failures."""
-    estimator = Estimator(options or Options(), sequence.calibration, 450.0, 700, 150)
-    bootstrap, stillness = Bootstrap(estimator, sequence.calibration), Stillness(450.0, 0.3)
+    given = given or sequence.calibration
+    estimator = Estimator(options or Options(), given, 450.0, 700, 150)
+    bootstrap, stillness = Bootstrap(estimator, given), Stillness(450.0, 0.3)
     previous, started, out, failures = None, False, [], []
     for k, (seen, imu) in enumerate(sequence):
         seen = change(k, seen)
@@ -73,6 +74,26 @@ def test_points_alone_and_lines_with_few_points_both_work(moving):
 
     _, t, p, *_ = run(moving, change=few)
     assert aligned_error(moving, t, p) < 0.05
+
+
+def test_a_wrong_rig_is_refined():
+    """Camera turned by 1 degree and moved by 1 cm against its calibration, images stamped 5 ms too early."""
+    wrong, given = calibration(), calibration()
+    moved = given.T_BC @ rigid(so3_exp(np.radians([0.6, -0.64, 0.48])), [0.006, -0.008, 0.0])
+    moving = Sequence(Trajectory.random(2), Room.random(2), replace(wrong, T_BC=moved), 20.0)
+    stamped_early = lambda k, seen: replace(seen, t_ns=seen.t_ns - 5_000_000)  # noqa: E731
+    estimator, t, p, _, failures = run(moving, change=stamped_early, given=given)
+    assert not any(failures)
+    assert aligned_error(moving, t, p) < 0.03
+    w = estimator.window
+    assert np.degrees(np.linalg.norm(so3_log(moved[:3, :3].T @ w.R_BC))) < 0.1
+    assert w.delay[0] == pytest.approx(0.005, abs=3e-4)
+    rig = estimator.rig()
+    assert rig.rotation_deg == pytest.approx(1.0, abs=0.1) and rig.delay_s == w.delay[0]
+    off = Options(extrinsic_sigma_deg=0.0, extrinsic_sigma_m=0.0, time_offset_sigma_s=0.0)
+    estimator, t, p, *_ = run(moving, off, stamped_early, given)
+    np.testing.assert_array_equal(estimator.window.R_BC, given.T_BC[:3, :3])
+    assert estimator.window.delay[0] == 0.0
 
 
 def test_biases_are_found(moving):

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from line_slam_ros.estimation.landmarks import back_substitute, retract_landmarks
-from line_slam_ros.estimation.solver import Solver, SolverOptions, retract_states
+from line_slam_ros.estimation.solver import Solver, SolverOptions, retract_rig, retract_states
 from line_slam_ros.estimation.window import STATE, Window
 from line_slam_ros.geometry.lie import so3_exp
 from line_slam_ros.geometry.line_forms import store_lines
@@ -11,6 +11,7 @@ from line_slam_ros.geometry.lines import line_from_points
 from line_slam_ros.types import ImuNoise, LineForm
 
 STATES, POINTS, LINES, SIGMA, NOISE = 4, 20, 10, 0.02, 0.05
+RIG_SIGMA = np.array([0.1, 0.1, 0.1, 0.02, 0.02, 0.02, 0.01])
 R_BC, p_BC = so3_exp([0.1, 0.2, 0.3]), np.array([0.1, 0.0, 0.05])
 
 
@@ -18,18 +19,19 @@ R_BC, p_BC = so3_exp([0.1, 0.2, 0.3]), np.array([0.1, 0.0, 0.05])
 def solver(request):
     """A window in which nothing agrees: random states, links, prior, points and lines, outliers among them."""
     rng, window = np.random.default_rng(0), Window(STATES + 2, ImuNoise(), POINTS, LINES)
+    window.set_rig(R_BC, p_BC, RIG_SIGMA)
     for k in range(STATES):
         t = np.linspace(0.0, 0.2, 41)
         samples = t, 0.1 * rng.normal(size=(41, 3)), 0.1 * rng.normal(size=(41, 3)) + [0, 0, 9.81]
         window.append(k * 200_000_000, so3_exp(0.1 * rng.normal(size=3)), [0.2 * k, 0, 0] + 0.05 * rng.normal(size=3),
                       0.1 * rng.normal(size=3), 0.01 * rng.normal(size=6), samples if k else None)
     window.still[1:3] = True
-    dim = STATE * STATES
-    A = rng.normal(size=(dim, dim))
-    window.prior_H[:dim, :dim], window.prior_g[:dim] = A @ A.T, rng.normal(size=dim)
+    rows = window.rows()
+    A = rng.normal(size=(len(rows), len(rows)))
+    window.prior_H[np.ix_(rows, rows)], window.prior_g[rows] = A @ A.T, rng.normal(size=len(rows))
     _fill_points(window, rng)
     _fill_lines(window, rng, request.param)
-    return Solver(window, SolverOptions(R_BC, p_BC, np.array([0.0, 0.0, -9.81]), 4.0, 4.0, request.param))
+    return Solver(window, SolverOptions(np.array([0.0, 0.0, -9.81]), 4.0, 4.0, request.param))
 
 
 def _fill_points(window, rng):
@@ -63,19 +65,22 @@ def test_eliminated_normal_equations_predict_the_slope_of_the_cost(solver, seed)
     """Along any step of the states, the landmarks following: g dx - sum a' A^-1 a, exactly, robust weights and all."""
     w, use_points, use_lines = solver.window, np.ones(POINTS, bool), np.ones(LINES, bool)
     solver.linearise(use_points, use_lines)
-    scale = np.tile(np.repeat([0.1, 0.01], [9, 6]), STATES)
-    dx = scale * np.random.default_rng(seed).normal(size=STATE * STATES)
-    predicted = solver.g[:len(dx)] @ dx
-    for use, seen, size, E, A, a, step in (
-            (use_points, w.points.seen, 3, solver._E_p, solver._A_p, solver._a_p, solver._step_p),
-            (use_lines, w.lines.seen, 4, solver._E_l, solver._A_l, solver._a_l, solver._step_l)):
-        back_substitute(w.n, use, seen, size, E, A, a, dx, step)
+    dx, rig = np.zeros(len(solver.g)), STATE * w.slots
+    dx[:STATE * STATES] = np.tile(np.repeat([0.1, 0.01], [9, 6]), STATES)
+    dx[rig:] = RIG_SIGMA
+    dx *= np.random.default_rng(seed).normal(size=len(dx))
+    predicted = solver.g @ dx
+    for use, seen, size, E, B, A, a, step in (
+            (use_points, w.points.seen, 3, solver._E_p, solver._B_p, solver._A_p, solver._a_p, solver._step_p),
+            (use_lines, w.lines.seen, 4, solver._E_l, solver._B_l, solver._A_l, solver._a_l, solver._step_l)):
+        back_substitute(w.n, use, seen, size, rig, E, B, A, a, dx, step)
         predicted -= np.einsum('ij,ijk,ik->', a, A, a)
     before = solver._save()
 
     def cost(part):
         solver._restore(before)
         retract_states(w.n, w.R, w.p, w.v, w.b, part * dx)
+        retract_rig(w.R_BC, w.p_BC, w.delay, part * dx[rig:])
         retract_landmarks(use_points, w.points.abr, part * solver._step_p, use_lines,
                           int(solver.options.line_form), w.lines.values, part * solver._step_l)
         return solver.cost()

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -47,11 +48,12 @@ class Metrics:
     def report(self, lines: int, drops: Counter[str], notes: list[str], slam: Any) -> dict[str, Any]:
         """All of it, ready for JSON; times in ms unless the name says otherwise."""
         wall, sensor = self._durations()
+        rig = slam.rig()
         return {
             'frames': self.frames, 'estimates': self.estimates, 'keyframes': self.keyframes, 'lines': lines,
             'resets': slam.resets, 'status': slam.status.value, 'waiting_for': slam.waiting_for,
             'duration_s': sensor, 'first_estimate_after_s': self._first_estimate_after,
-            'wall_s': wall, 'times_real_time': sensor / wall if wall > 0.0 else None,
+            'rig': rig and asdict(rig), 'wall_s': wall, 'times_real_time': sensor / wall if wall > 0.0 else None,
             'stages_ms': {stage: _percentiles(values) for stage, values in self._stages.items()},
             'drops': dict(sorted(drops.items())), 'status_changes': self._status_changes, 'notes': notes,
             'settings': self._settings}

@@ -11,8 +11,9 @@ from line_slam_ros.estimation.marginalisation import drop_state, marginalise_old
 from line_slam_ros.estimation.solver import Solver, SolverOptions
 from line_slam_ros.estimation.triangulation import start_lines, start_points
 from line_slam_ros.estimation.window import STATE, Window
+from line_slam_ros.geometry.lie import rigid
 from line_slam_ros.geometry.line_forms import unit_world_lines
-from line_slam_ros.types import F64, I64, Calibration, LineForm, Observations, Samples
+from line_slam_ros.types import F64, I64, Calibration, LineForm, Observations, RigCorrection, Samples
 
 MAX_GYRO_BIAS, MAX_ACCEL_BIAS, MAX_SPEED = 0.5, 2.5, 50.0  # rad/s, m/s^2, m/s: beyond, the estimate is nonsense
 MIN_FEATURES = 6  # fewer that an earlier state saw, too, and the camera is blind
@@ -41,9 +42,11 @@ class Estimator:
         rows = (options.window + 4) / 2
         self.window = Window(options.window + 1, calibration.imu_noise, int(rows * max_points), int(rows * max_lines))
         self.g_W = np.array([0.0, 0.0, -options.gravity])
-        self.R_BC, self.p_BC = calibration.T_BC[:3, :3].copy(), calibration.T_BC[:3, 3].copy()
+        self.window.set_rig(calibration.T_BC[:3, :3], calibration.T_BC[:3, 3], np.concatenate([
+            np.full(3, np.radians(options.extrinsic_sigma_deg)), np.full(3, options.extrinsic_sigma_m),
+            [options.time_offset_sigma_s]]))
         self.solver = Solver(self.window, SolverOptions(
-            self.R_BC, self.p_BC, self.g_W, options.loss_scale**2, options.loss_scale**2,
+            self.g_W, options.loss_scale**2, options.loss_scale**2,
             LineForm.of(options.line_representation)))
         self.newest_is_keyframe = True
         self.failure = ''
@@ -95,6 +98,12 @@ class Estimator:
         """(3,) rad/s; zero before the start."""
         return self.window.b[self.window.n - 1, :3] if self.window.n else np.zeros(3)
 
+    def rig(self) -> RigCorrection:
+        """How far the refined calibration is from the given one."""
+        w = self.window
+        rig = w.delta(np.empty(len(w.prior_g)))[STATE * w.slots:]
+        return RigCorrection(float(np.degrees(np.linalg.norm(rig[:3]))), float(np.linalg.norm(rig[3:6])), float(rig[6]))
+
     def covariance(self) -> F64:
         """(9, 9) of the newest state's [rotation in B, position in W, velocity in W], as of the last linearisation."""
         return self.solver.covariance(self.window.n - 1)[:9, :9]
@@ -121,8 +130,8 @@ class Estimator:
         rows = np.flatnonzero(t.solved[:t.count])
         pluecker, J = unit_world_lines(int(self.solver.options.line_form), t.values[rows], t.origin[rows])
         cov = J @ self.solver.line_covariances(rows) @ J.transpose(0, 2, 1)
-        T_WC = np.tile(np.eye(4), (n, 1, 1))
-        T_WC[:, :3, :3], T_WC[:, :3, 3] = w.R[:n] @ self.R_BC, w.p[:n] + w.R[:n] @ self.p_BC
+        R_WB, p_WB = self.solver.exposed()
+        T_WC = rigid(R_WB @ w.R_BC, p_WB + R_WB @ w.p_BC)
         return WindowLines(t.ids[rows], pluecker, cov, t.views[rows] + t.seen[rows, :n].sum(axis=1),
                            t.seen[rows, :n], t.z[rows, :n], T_WC)
 
@@ -185,11 +194,12 @@ class Estimator:
     def _triangulate(self) -> None:
         w, o, n = self.window, self.solver.options, self.window.n
         p, q = w.points, w.lines
-        start_points(n, w.R, w.p, self.R_BC, self.p_BC, ~p.solved[:p.count], p.seen, p.z, p.sigma, p.abr, p.R_WA,
+        R, position = self.solver.exposed()
+        start_points(n, R, position, w.R_BC, w.p_BC, ~p.solved[:p.count], p.seen, p.z, p.sigma, p.abr, p.R_WA,
                      p.p_WA, o.rho0, o.w_rho, p.solved)
         todo = ~q.solved[:q.count] & (q.seen[:q.count].sum(axis=1) >= self.options.line_min_views)
         min_sine = np.sin(np.radians(self.options.line_min_parallax_deg))
-        start_lines(n, w.R, w.p, self.R_BC, self.p_BC, todo, q.seen, q.z, min_sine,
+        start_lines(n, R, position, w.R_BC, w.p_BC, todo, q.seen, q.z, min_sine,
                     int(o.line_form), q.values, q.origin, q.solved)
 
     def _cull(self) -> tuple[I64, I64]:
@@ -229,7 +239,7 @@ class Estimator:
             return True
         if both.sum() < max(0.5 * now, 1):
             return bool(now > 0)
-        R = self.R_BC.T @ w.R[a].T @ w.R[b] @ self.R_BC
+        R = w.R_BC.T @ w.R[a].T @ w.R[b] @ w.R_BC
         rays = np.c_[t.z[:t.count, b][both], np.ones(both.sum())] @ R.T
         parallax = np.linalg.norm(rays[:, :2] / rays[:, 2:] - t.z[:t.count, a][both], axis=1)
         return float(np.mean(parallax)) * self.focal > self.options.keyframe_parallax_px

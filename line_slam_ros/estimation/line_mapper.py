@@ -90,6 +90,9 @@ class LineMapper:
         return Estimate(frame.t_ns, np.array(T_WB, float), zero, zero, zero, zero, np.zeros((9, 9)), is_keyframe,
                         self.timings)
 
+    def rig(self) -> None:
+        """The calibration is not refined in this mode."""
+
     def active_lines(self) -> LineSegments:
         """The lines seen lately."""
         return self.line_map.active()

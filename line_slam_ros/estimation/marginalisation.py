@@ -39,15 +39,14 @@ def _into_prior(solver: Solver, slot: int, points: np.ndarray, lines: np.ndarray
     The gradient is taken at the present state and carried back to the first estimates, which are
     frozen from now on for every state the prior touches.
     """
-    window, dim = solver.window, STATE * solver.window.n
+    window = solver.window
     solver.linearise(points, lines, links=links)
-    H, g = solver.H[:dim, :dim], solver.g[:dim]
     gone = np.arange(STATE * slot, STATE * (slot + 1))
-    kept = np.setdiff1d(np.arange(dim), gone)
-    reduced_H, reduced_g = eliminate(H, g, gone, kept)
+    kept = np.setdiff1d(window.rows(), gone)
+    reduced_H, reduced_g = eliminate(solver.H, solver.g, gone, kept)
     touched = np.unique(kept[np.any(reduced_H != 0.0, axis=1)] // STATE)
-    window.freeze(touched)
-    delta = solver.state_delta()
+    window.freeze(touched[touched < window.n])
+    delta = window.delta(np.empty(len(window.prior_g)))
     window.prior_H[:], window.prior_g[:] = 0.0, 0.0
     window.prior_H[np.ix_(kept, kept)] = reduced_H
     window.prior_g[kept] = reduced_g - reduced_H @ delta[kept]

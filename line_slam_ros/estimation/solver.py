@@ -19,7 +19,7 @@ from line_slam_ros.estimation.landmarks import (
     point_cost,
     retract_landmarks,
 )
-from line_slam_ros.estimation.window import STATE, Window, state_difference
+from line_slam_ros.estimation.window import RIG, STATE, Window
 from line_slam_ros.factors.imu_factor import imu_jacobians, imu_residual
 from line_slam_ros.geometry.lie_kernels import retract_rotation
 from line_slam_ros.types import F64, LineForm
@@ -80,12 +80,31 @@ def retract_states(n, R, p, v, b, dx):
             b[k, i] += dx[o + 9 + i]
 
 
+@njit(cache=True, nogil=True, error_model='numpy')
+def exposures(n, R, p, v, rates, delay, R_exposed, p_exposed, twist):
+    """Poses delay (s) after the states' stamps, to first order, and twist (n, 6) = [rates in B, v in W]."""
+    turn = np.empty(3)
+    for k in range(n):
+        for i in range(3):
+            turn[i] = rates[k, i] * delay
+            p_exposed[k, i] = p[k, i] + v[k, i] * delay
+            twist[k, i], twist[k, 3 + i] = rates[k, i], v[k, i]
+        retract_rotation(R[k], turn, R_exposed[k])
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def retract_rig(R_BC, p_BC, delay, dx):
+    """Apply a step dx (7,) to the rig in place."""
+    retract_rotation(R_BC, dx[:3], R_BC)
+    for i in range(3):
+        p_BC[i] += dx[3 + i]
+    delay[0] += dx[6]
+
+
 @dataclass(frozen=True, slots=True)
 class SolverOptions:
     """Numbers the optimiser needs besides the window."""
 
-    R_BC: F64  # (3, 3)
-    p_BC: F64  # (3,)
     g_W: F64  # (3,) m/s^2
     point_c2: float  # Cauchy scale of points, squared standard deviations
     line_c2: float
@@ -101,9 +120,12 @@ class Solver:
 
     def __init__(self, window: Window, options: SolverOptions):
         self.window, self.options = window, options
-        dim, rows_p, rows_l, slots = STATE * window.slots, len(window.points.ids), len(window.lines.ids), window.slots
-        self.H, self.g, self._delta = np.zeros((dim, dim)), np.zeros(dim), np.zeros(dim)
+        size, rows_p, rows_l, slots = len(window.prior_g), len(window.points.ids), len(window.lines.ids), window.slots
+        self.H, self.g, self._delta, self._dx = np.zeros((size, size)), np.zeros(size), np.zeros(size), np.zeros(size)
+        self._R, self._p, self._twist = np.zeros((slots, 3, 3)), np.zeros((slots, 3)), np.zeros((slots, 6))
+        self._R0, self._p0 = np.zeros((slots, 3, 3)), np.zeros((slots, 3))
         self._E_p, self._E_l = np.zeros((rows_p, slots, 3, 6)), np.zeros((rows_l, slots, 4, 6))
+        self._B_p, self._B_l = np.zeros((rows_p, 3, RIG)), np.zeros((rows_l, 4, RIG))
         self._A_p, self._A_l = np.zeros((rows_p, 3, 3)), np.zeros((rows_l, 4, 4))
         self._a_p, self._a_l = np.zeros((rows_p, 3)), np.zeros((rows_l, 4))
         self._step_p, self._step_l = np.zeros((rows_p, 3)), np.zeros((rows_l, 4))
@@ -117,20 +139,37 @@ class Solver:
         """
         w, o, n = self.window, self.options, self.window.n
         w.unfrozen_to_current()
-        dim = STATE * n
-        self.H[:dim, :dim], self.g[:dim] = w.prior_H[:dim, :dim], w.prior_g[:dim]
-        self.g[:dim] += w.prior_H[:dim, :dim] @ self.state_delta()
+        self.H[:] = w.prior_H
+        self.g[:] = w.prior_g + w.prior_H @ w.delta(self._delta)
         first, last = links or (0, n - 1)
         add_links(first, last, w.R, w.p, w.v, w.b, w.R0, w.p0, w.v0, w.b0, w.dt, w.dR, w.dp, w.dv, w.J_b, w.b_lin,
                   w.W, w.w_b, o.g_W, self.H, self.g)
         self._add_rest(first, last, n if links is None else last)
-        t = w.points
-        add_points(n, w.R, w.p, w.R0, w.p0, o.R_BC, o.p_BC, use_points, t.seen, t.z, t.sigma, t.abr, t.R_WA, t.p_WA,
-                   o.point_c2, o.rho0, o.w_rho, damping, self.H, self.g, self._E_p, self._A_p, self._a_p)
+        self._expose()
+        exposures(n, w.R0, w.p0, w.v, w.rates, w.delay[0], self._R0, self._p0, self._twist)
+        t, rig = w.points, self._rig()
+        add_points(n, self._R, self._p, self._R0, self._p0, w.R_BC, w.p_BC, self._twist, rig, use_points, t.seen, t.z,
+                   t.sigma, t.abr, t.R_WA, t.p_WA, o.point_c2, o.rho0, o.w_rho, damping, self.H, self.g, self._E_p,
+                   self._B_p, self._A_p, self._a_p)
         t = w.lines
-        add_lines(n, w.R, w.p, w.R0, w.p0, o.R_BC, o.p_BC, use_lines, t.seen, t.z, t.sigma, int(o.line_form),
-                  t.values, t.origin, o.line_c2, damping, self.H, self.g, self._E_l, self._A_l, self._a_l)
-        mirror(n, self.H)
+        add_lines(n, self._R, self._p, self._R0, self._p0, w.R_BC, w.p_BC, self._twist, rig, use_lines, t.seen, t.z,
+                  t.sigma, int(o.line_form), t.values, t.origin, o.line_c2, damping, self.H, self.g, self._E_l,
+                  self._B_l, self._A_l, self._a_l)
+        mirror(n, rig, self.H)
+
+    def _rig(self) -> int:
+        """First row of the rig, -1 when it is not estimated."""
+        return STATE * self.window.slots if self.window.rig_sigma.any() else -1
+
+    def _expose(self) -> None:
+        """Body poses at the times when the images were really taken."""
+        w = self.window
+        exposures(w.n, w.R, w.p, w.v, w.rates, w.delay[0], self._R, self._p, self._twist)
+
+    def exposed(self) -> tuple[F64, F64]:
+        """R_WB (n, 3, 3) and p_WB (n, 3) when the images of the window were taken."""
+        self._expose()
+        return self._R[:self.window.n], self._p[:self.window.n]
 
     def _add_rest(self, first: int, last: int, end: int) -> None:
         """States [first, end) at rest have no velocity; links [first, last) between two of them have no length."""
@@ -155,22 +194,17 @@ class Solver:
         return 0.5 * float(np.sum((w.v[:n][w.still[:n]] / o.still_speed) ** 2)
                            + np.sum((np.diff(w.p[:n], axis=0)[both] / o.still_shift) ** 2))
 
-    def state_delta(self) -> F64:
-        """(15 n,) present states minus their first estimates."""
-        w = self.window
-        state_difference(w.n, w.R, w.p, w.v, w.b, w.R0, w.p0, w.v0, w.b0, self._delta)
-        return self._delta[:STATE * w.n]
-
     def cost(self) -> float:
         """Present robust cost; refreshes chi2_points and chi2_lines (rows, slots)."""
         w, o, n = self.window, self.options, self.window.n
-        dim, p, q = STATE * n, w.points, w.lines
-        d = self.state_delta()
-        prior = d @ (0.5 * (w.prior_H[:dim, :dim] @ d) + w.prior_g[:dim])
+        p, q = w.points, w.lines
+        d = w.delta(self._delta)
+        prior = d @ (0.5 * (w.prior_H @ d) + w.prior_g)
+        self._expose()
         return (prior + self._rest_cost() + self.inertial_cost()
-                + point_cost(n, w.R, w.p, o.R_BC, o.p_BC, p.solved[:p.count], p.seen, p.z, p.sigma, p.abr, p.R_WA,
-                             p.p_WA, o.point_c2, o.rho0, o.w_rho, self.chi2_points)
-                + line_cost(n, w.R, w.p, o.R_BC, o.p_BC, q.solved[:q.count], q.seen, q.z, q.sigma,
+                + point_cost(n, self._R, self._p, w.R_BC, w.p_BC, p.solved[:p.count], p.seen, p.z, p.sigma, p.abr,
+                             p.R_WA, p.p_WA, o.point_c2, o.rho0, o.w_rho, self.chi2_points)
+                + line_cost(n, self._R, self._p, w.R_BC, w.p_BC, q.solved[:q.count], q.seen, q.z, q.sigma,
                             int(o.line_form), q.values, q.origin, o.line_c2, self.chi2_lines))
 
     def inertial_cost(self) -> float:
@@ -201,16 +235,19 @@ class Solver:
         return self.cost()
 
     def _step(self, use_p, use_l) -> bool:
-        w, dim = self.window, STATE * self.window.n
-        H = self.H[:dim, :dim].copy()
-        H[np.arange(dim), np.arange(dim)] *= 1.0 + self._damping
+        w, rows, dx = self.window, self.window.rows(), self._dx
+        H = self.H[np.ix_(rows, rows)]
+        H[np.arange(len(rows)), np.arange(len(rows))] *= 1.0 + self._damping
+        dx[:] = 0.0
         try:
-            dx = -cho_solve(cho_factor(H, lower=True, check_finite=False), self.g[:dim], check_finite=False)
+            dx[rows] = -cho_solve(cho_factor(H, lower=True, check_finite=False), self.g[rows], check_finite=False)
         except LinAlgError:
             return False
-        back_substitute(w.n, use_p, w.points.seen, 3, self._E_p, self._A_p, self._a_p, dx, self._step_p)
-        back_substitute(w.n, use_l, w.lines.seen, 4, self._E_l, self._A_l, self._a_l, dx, self._step_l)
+        rig, p, q = self._rig(), w.points, w.lines
+        back_substitute(w.n, use_p, p.seen, 3, rig, self._E_p, self._B_p, self._A_p, self._a_p, dx, self._step_p)
+        back_substitute(w.n, use_l, q.seen, 4, rig, self._E_l, self._B_l, self._A_l, self._a_l, dx, self._step_l)
         retract_states(w.n, w.R, w.p, w.v, w.b, dx)
+        retract_rig(w.R_BC, w.p_BC, w.delay, dx[STATE * w.slots:])
         retract_landmarks(use_p, w.points.abr, self._step_p, use_l, int(self.options.line_form),
                           w.lines.values, self._step_l)
         return True
@@ -226,14 +263,15 @@ class Solver:
     @staticmethod
     def _variables(w: Window) -> list[tuple[np.ndarray, int]]:
         n, p, q = w.n, w.points.count, w.lines.count
-        return [(w.R, n), (w.p, n), (w.v, n), (w.b, n), (w.points.abr, p), (w.lines.values, q)]
+        return [(w.R, n), (w.p, n), (w.v, n), (w.b, n), (w.R_BC, 3), (w.p_BC, 3), (w.delay, 1), (w.points.abr, p),
+                (w.lines.values, q)]
 
     def covariance(self, slot: int) -> F64:
         """(15, 15) of one state given everything in the window; needs a fresh linearise."""
-        dim, o = STATE * self.window.n, STATE * slot
-        rhs = np.zeros((dim, STATE))
+        rows, o = self.window.rows(), STATE * slot
+        rhs = np.zeros((len(rows), STATE))
         rhs[o:o + STATE] = np.eye(STATE)
-        factor = cho_factor(self.H[:dim, :dim] + 1e-9 * np.eye(dim), lower=True, check_finite=False)
+        factor = cho_factor(self.H[np.ix_(rows, rows)] + 1e-9 * np.eye(len(rows)), lower=True, check_finite=False)
         return cho_solve(factor, rhs, check_finite=False)[o:o + STATE]
 
     def line_covariances(self, rows: np.ndarray) -> F64:

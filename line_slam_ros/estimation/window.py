@@ -1,6 +1,8 @@
-"""What the optimiser works on: states of the sliding window, their inertial links, landmark tables and the prior.
+"""What the optimiser works on: states of the sliding window, their inertial links, landmark tables, the rig, the prior.
 
-Structure of arrays, allocated once; slot 0 is the oldest state, slot n - 1 the newest.
+Structure of arrays, allocated once; slot 0 is the oldest state, slot n - 1 the newest. The rig is how camera and IMU
+belong together: the camera's pose in the body, and by how much an image was taken later than its stamp says. Its rows
+in the equations come after those of the last slot, used or not.
 """
 from __future__ import annotations
 
@@ -15,6 +17,7 @@ from line_slam_ros.types import F64, I64, ImuNoise, Samples
 REST_S = 2.0  # longer at rest, the accelerometer only ties tilt and bias ever tighter: too stiff to solve, nothing new
 REST_SAMPLES = 1000  # inertial samples of a link between states at rest beyond which they are averaged
 STATE = 15  # [rotation, position, velocity, gyro bias, accelerometer bias]
+RIG = 7  # [rotation and position of the camera in the body, time offset]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -30,6 +33,17 @@ def state_difference(n, R, p, v, b, R0, p0, v0, b0, delta):
             delta[o + 6 + i] = v[k, i] - v0[k, i]
         for i in range(6):
             delta[o + 9 + i] = b[k, i] - b0[k, i]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def rig_difference(R_BC, p_BC, delay, R_given, p_given, delta):
+    """delta (7,) = present rig minus the given one, which has no delay."""
+    E = np.empty((3, 3))
+    multiply_transposed(R_given, R_BC, E)
+    log_so3(E, delta[:3])
+    for i in range(3):
+        delta[3 + i] = p_BC[i] - p_given[i]
+    delta[6] = delay[0]
 
 
 def averaged(samples: Samples) -> Samples:
@@ -111,7 +125,12 @@ class Window:
         self.J_b, self.cov, self.W = np.zeros((slots, 9, 6)), np.zeros((slots, 9, 9)), np.zeros((slots, 9, 9))
         self.w_b, self.b_lin = np.zeros((slots, 6)), np.zeros((slots, 6))
         self.samples: list[Samples] = []  # raw t (s), gyro, accel of each link
-        self.prior_H, self.prior_g = np.zeros((STATE * slots, STATE * slots)), np.zeros(STATE * slots)
+        self.rates = np.zeros((slots, 3))  # angular velocity of each state, rad/s, in B
+        self.calibrated = np.eye(3), np.zeros(3)  # R_BC, p_BC as given
+        self.R_BC, self.p_BC, self.delay = np.eye(3), np.zeros(3), np.zeros(1)  # delay: s, of the image after its stamp
+        self.rig_sigma = np.zeros(RIG)  # of what was given; what is zero is not estimated
+        size = STATE * slots + RIG
+        self.prior_H, self.prior_g = np.zeros((size, size)), np.zeros(size)
         self.points = LandmarkTable(max_points, slots, (2,), {'abr': (3,), 'R_WA': (3, 3), 'p_WA': (3,)})
         self.lines = LandmarkTable(max_lines, slots, (2, 2), {'values': (VALUES,), 'origin': (3,)})
 
@@ -120,6 +139,29 @@ class Window:
         self.n, self.points.count, self.lines.count = 0, 0, 0
         self.samples.clear()
         self.prior_H[:], self.prior_g[:] = 0.0, 0.0
+        self.R_BC[:], self.p_BC[:], self.delay[:] = *self.calibrated, 0.0
+        free = self.rig_rows()
+        self.prior_H[free, free] = self.rig_sigma[free - STATE * self.slots]**-2.0
+
+    def set_rig(self, R_BC: F64, p_BC: F64, sigma: F64) -> None:
+        """The camera in the body as calibrated, and sigma (7,), how far that may be wrong (0: not at all)."""
+        self.calibrated, self.rig_sigma = (R_BC.copy(), p_BC.copy()), sigma
+        self.clear()
+
+    def rig_rows(self) -> I64:
+        """Rows of the rig that are estimated."""
+        return STATE * self.slots + np.flatnonzero(self.rig_sigma)
+
+    def rows(self) -> I64:
+        """All rows of the equations that are in use."""
+        return np.concatenate([np.arange(STATE * self.n), self.rig_rows()])
+
+    def delta(self, out: F64) -> F64:
+        """out (15 slots + 7,) = present states and rig minus their first estimates, zero where not in use."""
+        out[STATE * self.n:] = 0.0
+        state_difference(self.n, self.R, self.p, self.v, self.b, self.R0, self.p0, self.v0, self.b0, out)
+        rig_difference(self.R_BC, self.p_BC, self.delay, *self.calibrated, out[STATE * self.slots:])
+        return out
 
     def append(self, t_ns: int, R: F64, p: F64, v: F64, b: F64, samples: Samples | None) -> int:
         """Add the newest state; samples are those since the previous one (None for the first). Returns its slot."""
@@ -130,6 +172,9 @@ class Window:
             assert samples is not None
             self.samples.append(samples)
             self.integrate(k - 1)
+            self.rates[k] = samples[1][-1] - b[:3]
+            if k == 1:
+                self.rates[0] = samples[1][0] - b[:3]
         self.n += 1
         return k
 
@@ -155,10 +200,9 @@ class Window:
     def recentre_prior(self) -> None:
         """Move every first estimate to the present state and the prior along; rotations to first order."""
         dim = STATE * self.n
-        delta = np.empty(dim)
-        state_difference(self.n, self.R, self.p, self.v, self.b, self.R0, self.p0, self.v0, self.b0, delta)
+        delta = self.delta(np.empty(len(self.prior_g)))[:dim]
         delta.reshape(-1, STATE)[~self.frozen[:self.n]] = 0.0
-        self.prior_g[:dim] += self.prior_H[:dim, :dim] @ delta
+        self.prior_g += self.prior_H[:, :dim] @ delta
         for first, now in ((self.R0, self.R), (self.p0, self.p), (self.v0, self.v), (self.b0, self.b)):
             first[:self.n] = now[:self.n]
 
@@ -180,7 +224,7 @@ class Window:
         elif self.samples:
             del self.samples[0 if slot == 0 else -1]
         for a in (self.t_ns, self.R, self.p, self.v, self.b, self.R0, self.p0, self.v0, self.b0, self.frozen,
-                  self.still):
+                  self.still, self.rates):
             a[slot:n - 1] = a[slot + 1:n]
         for a in (self.dt, self.dR, self.dp, self.dv, self.J_b, self.cov, self.W, self.w_b, self.b_lin):
             a[slot:n - 2] = a[slot + 1:n - 1]
@@ -194,7 +238,7 @@ class Window:
     def _remove_from_prior(self, slot: int) -> None:
         lo, hi, end = STATE * slot, STATE * (slot + 1), STATE * self.n
         H, g = self.prior_H, self.prior_g
-        H[lo:end - STATE, :end] = H[hi:end, :end].copy()
-        H[:end, lo:end - STATE] = H[:end, hi:end].copy()
+        H[lo:end - STATE] = H[hi:end].copy()
+        H[:, lo:end - STATE] = H[:, hi:end].copy()
         g[lo:end - STATE] = g[hi:end].copy()
-        H[end - STATE:end, :end], H[:end, end - STATE:end], g[end - STATE:end] = 0.0, 0.0, 0.0
+        H[end - STATE:end], H[:, end - STATE:end], g[end - STATE:end] = 0.0, 0.0, 0.0

@@ -14,7 +14,7 @@ from line_slam_ros.frontend.rows import Rows
 from line_slam_ros.geometry.camera import Camera
 from line_slam_ros.types import F64, I64, U8, LineObservations
 
-SIGMA_FLOOR_PX = 0.25  # what a fit to one image cannot know: blur, lens model, edges that are not sharp
+SIGMA_FLOOR_PX = 0.2  # what a fit to one image cannot know: blur, lens model, edges that are not sharp
 SAME_EDGE_PX = 3.0
 REFILL = 0.9  # of max_count: below, new segments are looked for
 DETECT_EVERY = 5  # images, at most

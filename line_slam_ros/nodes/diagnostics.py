@@ -14,7 +14,7 @@ from line_slam_ros.nodes.health import Latency, Recent
 from line_slam_ros.nodes.inputs import Inputs
 from line_slam_ros.nodes.publishers import NO_EVENTS
 from line_slam_ros.shell_config import ShellConfig
-from line_slam_ros.types import Estimate, Status
+from line_slam_ros.types import Estimate, RigCorrection, Status
 from msg_adapters import outputs
 from msg_adapters.factories import ros_messages
 
@@ -34,6 +34,8 @@ class Estimator(Protocol):
     resets: int
     timings: dict[str, float]
 
+    def rig(self) -> RigCorrection | None: ...
+
 
 class Diagnostics:
     """Collects in both threads (plain assignments and counters), publishes in the executor's."""
@@ -45,6 +47,7 @@ class Diagnostics:
         self._publisher = node.create_publisher(kind, '/diagnostics', 10, event_callbacks=NO_EVENTS)
         self.waiting_for = ''
         self._status, self._resets, self._poses = Status.INITIALISING, 0, 0
+        self._rig: RigCorrection | None = None
         self._latency = Latency()
         self._notes = Recent(REMEMBER_S)
         self._drops: Counter[str] = Counter()
@@ -53,6 +56,7 @@ class Diagnostics:
     def processed(self, estimator: Estimator, estimate: Estimate | None, publish_s: float) -> None:
         """The worker is done with a frame."""
         self._status, self.waiting_for, self._resets = estimator.status, estimator.waiting_for, estimator.resets
+        self._rig = estimator.rig()
         self._latency.add({**estimator.timings, 'publish': publish_s})
         self._poses += estimate is not None
 
@@ -70,11 +74,19 @@ class Diagnostics:
         warnings = list(self._warnings(now))
         values |= {'frames processed': f'{latency.frames / seconds:.1f} Hz', 'poses': f'{poses / seconds:.1f} Hz',
                    'resets': str(self._resets), 'executor CPU': f'{100 * (cpu - self._cpu_then) / seconds:.0f} %',
-                   **latency.summary(), **{f'dropped: {reason}': str(n) for reason, n in self._drops.items()}}
+                   **self._calibration(), **latency.summary(),
+                   **{f'dropped: {reason}': str(n) for reason, n in self._drops.items()}}
         self._then, self._cpu_then = now, cpu
         stamp = self._node.get_clock().now().nanoseconds
         self._publisher.publish(outputs.diagnostics(self._new, stamp, self._status, self.waiting_for, values,
                                                     self._node.get_name(), warnings))
+
+    def _calibration(self) -> dict[str, str]:
+        """What was refined of it, for people."""
+        rig = self._rig
+        return {} if rig is None else {
+            'camera to IMU': f'refined by {rig.rotation_deg:.2f} deg, {1e3 * rig.shift_m:.1f} mm',
+            'time offset': f'refined by {1e3 * rig.delay_s:.2f} ms'}
 
     def _warnings(self, now: float) -> Iterator[str]:
         yield from filter(None, (self._inputs.problem,))
