@@ -15,6 +15,7 @@ from line_slam_ros.types import F64, Calibration, ImuBatch, ImuNoise, LineObserv
 
 GRAVITY_W = np.array([0.0, 0.0, -9.81])
 ROOM = np.array([6.0, 5.0, 2.5])  # m, walls at +- half in x and y, floor at 0
+CORRIDOR = np.array([60.0, 2.2, 2.5])  # m, along x from the start
 CAMERA_IN_BODY = np.array([[0.0, 0.0, 1.0, 0.02], [-1.0, 0.0, 0.0, -0.05], [0.0, -1.0, 0.0, 0.01],
                            [0.0, 0.0, 0.0, 1.0]])
 
@@ -27,6 +28,7 @@ class Trajectory:
     frequency: F64  # (K, 6) rad/s
     phase: F64  # (K, 6)
     rest: float
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m/s, of a steady motion on top
 
     @staticmethod
     def random(seed: int, rest: float = 0.0, speed: float = 1.0) -> Trajectory:
@@ -35,6 +37,13 @@ class Trajectory:
         amplitude = rng.uniform(0.5, 1.0, (3, 6)) * np.array([0.5, 0.5, 0.25, 0.12, 0.12, 0.35])
         return Trajectory(amplitude, speed * rng.uniform(0.5, 2.0, (3, 6)), rng.uniform(0, 2 * np.pi, (3, 6)), rest)
 
+    @staticmethod
+    def walk(seed: int, speed: float = 0.8) -> Trajectory:
+        """A walk along a corridor: steady, with the sway of a hand; it looks about by some 20 degrees."""
+        sway = Trajectory.random(seed, speed=2.0)
+        return Trajectory(sway.amplitude * np.array([0.15, 0.3, 0.3, 0.6, 0.6, 0.6]), sway.frequency, sway.phase, 0.0,
+                          (speed, 0.0, 0.0))
+
     def _sums(self, t: F64) -> tuple[F64, F64, F64]:
         """Values (N, 6) and two derivatives; eased in from rest by a quintic time warp over one second."""
         s = np.clip(t - self.rest, 0.0, None)[:, None, None]
@@ -42,8 +51,9 @@ class Trajectory:
         w, dw, ddw = u**4 - 0.6 * u**5 + (s - u), 4 * u**3 - 3 * u**4, 12 * u**2 - 12 * u**3
         a, f = self.amplitude, self.frequency
         sine, cosine = np.sin(f * w + self.phase), np.cos(f * w + self.phase)
-        return ((a * sine).sum(axis=1), (a * f * cosine * dw).sum(axis=1),
-                (a * f * (cosine * ddw - f * sine * dw**2)).sum(axis=1))
+        steady = np.array([*self.velocity, 0.0, 0.0, 0.0])
+        return ((a * sine).sum(axis=1) + steady * w[:, 0], (a * f * cosine * dw).sum(axis=1) + steady * dw[:, 0],
+                (a * f * (cosine * ddw - f * sine * dw**2)).sum(axis=1) + steady * ddw[:, 0])
 
     def at(self, t: F64) -> tuple[F64, F64, F64, F64, F64]:
         """R_WB (N, 3, 3), p_W, v_W, angular velocity in B, specific force in B, each (N, 3)."""
@@ -64,19 +74,30 @@ class Room:
     @staticmethod
     def random(seed: int, points: int = 600, lines: int = 120) -> Room:
         """Lines run along the axes of the room, 0.5 to 2 m long, as in buildings."""
+        return Room._furnished(seed, points, lines, ROOM)
+
+    @staticmethod
+    def corridor(seed: int, points: int = 1500, lines: int = 400) -> Room:
+        """A long one along x, with doors, frames and skirtings."""
+        room = Room._furnished(seed, points, lines, CORRIDOR)
+        forward = np.array([CORRIDOR[0] / 2 - 3.0, 0.0, 0.0])
+        return Room(room.points + forward, room.lines + forward)
+
+    @staticmethod
+    def _furnished(seed: int, points: int, lines: int, size: F64) -> Room:
         rng = np.random.default_rng(seed)
-        middle = _on_walls(rng, lines)
+        middle = _on_walls(rng, lines, size)
         half = np.zeros((lines, 3))
-        wall = np.argmax(np.abs(middle - [0, 0, ROOM[2] / 2]) / (ROOM / 2), axis=1)
+        wall = np.argmax(np.abs(middle - [0, 0, size[2] / 2]) / (size / 2), axis=1)
         along = (wall + rng.integers(1, 3, lines)) % 3
         half[np.arange(lines), along] = rng.uniform(0.25, 1.0, lines)
-        return Room(_on_walls(rng, points), np.stack([middle - half, middle + half], axis=1))
+        return Room(_on_walls(rng, points, size), np.stack([middle - half, middle + half], axis=1))
 
 
-def _on_walls(rng: np.random.Generator, count: int) -> F64:
-    p = rng.uniform(-0.5, 0.5, (count, 3)) * ROOM + [0, 0, ROOM[2] / 2]
+def _on_walls(rng: np.random.Generator, count: int, size: F64) -> F64:
+    p = rng.uniform(-0.5, 0.5, (count, 3)) * size + [0, 0, size[2] / 2]
     wall, side = rng.integers(0, 3, count), rng.choice([-0.5, 0.5], count)
-    p[np.arange(count), wall] = (side[:, None] * ROOM + [0, 0, ROOM[2] / 2])[np.arange(count), wall]
+    p[np.arange(count), wall] = (side[:, None] * size + [0, 0, size[2] / 2])[np.arange(count), wall]
     return p
 
 
@@ -98,6 +119,7 @@ class Sequence:
     imu_rate: float = 200.0
     pixel_sigma: float = 0.3
     seed: int = 0
+    max_points: int = 10**9  # seen at a time
     gyro_bias: tuple[float, float, float] = (0.01, -0.02, 0.03)
     accel_bias: tuple[float, float, float] = (0.05, -0.03, 0.08)
 
@@ -129,7 +151,7 @@ class Sequence:
         R_WC, p_WC = R[0] @ T_BC[:3, :3], p[0] + R[0] @ T_BC[:3, 3]
         sigma = self.pixel_sigma / fx
         x, visible = self._project((self.room.points - p_WC) @ R_WC)
-        ids = np.flatnonzero(visible)
+        ids = np.flatnonzero(visible)[:self.max_points]  # ids are in no order, so these are spread over the image
         z = x[ids] + sigma * rng.normal(size=(len(ids), 2))
         ends, seen = self._project((self.room.lines - p_WC) @ R_WC)
         lines = np.flatnonzero(seen.all(axis=1))
