@@ -86,3 +86,22 @@ def test_eliminated_normal_equations_predict_the_slope_of_the_cost(solver, seed)
         return solver.cost()
 
     assert (cost(1e-5) - cost(-1e-5)) / 2e-5 == pytest.approx(predicted, rel=1e-6)
+
+
+def test_covariance_of_a_line_is_that_of_the_joint_equations_with_the_newest_pose_fixed(solver):
+    w = solver.window
+    solver.linearise(np.ones(POINTS, bool), np.ones(LINES, bool))
+    rows, newest = w.rows(), STATE * (w.n - 1)
+    kept = np.flatnonzero((rows < newest) | (rows >= newest + 6))
+    found = solver.line_covariances(np.arange(LINES))
+    for i in range(LINES):
+        W = np.zeros((4, len(solver.g)))
+        for slot in np.flatnonzero(w.lines.seen[i, :w.n]):
+            W[:, STATE * slot:STATE * slot + 6] = solver._E_l[i, slot]
+        W[:, STATE * w.slots:] = solver._B_l[i]
+        A_inverse, W = solver._A_l[i], W[:, rows]
+        states = solver.H[np.ix_(rows, rows)] + W.T @ A_inverse @ W  # the line not eliminated
+        joint = np.block([[states, W.T], [W, np.linalg.inv(A_inverse)]])
+        free = np.append(kept, len(rows) + np.arange(4))
+        expected = np.linalg.inv(joint[np.ix_(free, free)])[-4:, -4:]
+        np.testing.assert_allclose(found[i], expected, atol=1e-6 * np.abs(expected).max())

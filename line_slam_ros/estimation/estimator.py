@@ -124,7 +124,7 @@ class Estimator:
         return np.einsum('nij,nj->ni', t.R_WA[c], rays) + t.p_WA[c]
 
     def lines(self) -> WindowLines:
-        """Solved lines of the window with their covariance, poses held fixed."""
+        """Solved lines of the window with their covariance, the newest pose held fixed."""
         self.linearise()
         w, t, n = self.window, self.window.lines, self.window.n
         rows = np.flatnonzero(t.solved[:t.count])

@@ -274,6 +274,23 @@ class Solver:
         factor = cho_factor(self.H[np.ix_(rows, rows)] + 1e-9 * np.eye(len(rows)), lower=True, check_finite=False)
         return cho_solve(factor, rhs, check_finite=False)[o:o + STATE]
 
-    def line_covariances(self, rows: np.ndarray) -> F64:
-        """(L, 4, 4) of lines in their tangent, the states held fixed; needs a fresh linearise."""
-        return self._A_l[rows]
+    def line_covariances(self, lines: np.ndarray) -> F64:
+        """(L, 4, 4) of the lines in those rows, in their tangent, as the newest camera knows them; after a linearise.
+
+        A^-1 + (A^-1 W) S (A^-1 W)' with W = [E B] the ties to poses and rig and S the covariance of these, given the
+        newest pose: where that pose is in the world is not the line's doubt, how the others stood to it is.
+        """
+        w, A = self.window, self._A_l[lines]
+        newest = STATE * (w.n - 1)
+        rows = np.setdiff1d(w.rows(), np.arange(newest, newest + 6))
+        tied = rows[(rows >= STATE * w.slots) | ((rows % STATE < 6) & (rows < newest))]
+        W = np.zeros((len(lines), 4, len(self.g)))
+        for slot in range(w.n):
+            W[:, :, STATE * slot:STATE * slot + 6] = self._E_l[lines, slot] * w.lines.seen[lines, slot, None, None]
+        W[:, :, STATE * w.slots:] = self._B_l[lines]
+        ties = np.zeros((len(rows), len(tied)))
+        ties[np.searchsorted(rows, tied), np.arange(len(tied))] = 1.0
+        factor = cho_factor(self.H[np.ix_(rows, rows)] + 1e-9 * np.eye(len(rows)), lower=True, check_finite=False)
+        S = cho_solve(factor, ties, check_finite=False)[np.searchsorted(rows, tied)]
+        AW = A @ W[:, :, tied]
+        return A + AW @ S @ AW.transpose(0, 2, 1)
