@@ -74,7 +74,7 @@ class Estimator(Checked):
     gate_chi2: float = param(20.0, 'squared whitened residual over which an observation is an outlier', 3.0, 1000.0)
     gravity: float = param(9.81, 'magnitude of gravity, m/s^2', 9.0, 10.0)
     gyro_bias_sigma: float = param(0.05, 'uncertainty of the initial gyro bias, rad/s', 1e-5, 1.0)
-    accel_bias_sigma: float = param(0.2, 'uncertainty of the initial accelerometer bias (mean 0), m/s^2', 1e-4, 5.0)
+    accel_bias_sigma: float = param(0.1, 'uncertainty of the initial accelerometer bias (mean 0), m/s^2', 1e-4, 5.0)
     extrinsic_sigma_deg: float = param(0.5, 'how well the rotation between camera and IMU is calibrated (standard '
                                        'deviation); it is refined, but with 0, deg', 0.0, 10.0)
     extrinsic_sigma_m: float = param(0.005, 'the same of the position of the camera in the body, m', 0.0, 0.5)

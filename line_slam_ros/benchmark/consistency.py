@@ -1,7 +1,8 @@
 """Monte Carlo on simulated features: accuracy, and whether the covariance tells the truth.
 
-Each run is a room of random points and lines, a random smooth motion and inertial data with noise as of EuRoC's IMU;
-every other run starts from rest. The observations go to the estimator without images, the start included.
+Each run is a room of random points and lines with a random smooth motion in it, or a walk along a corridor, and
+inertial data with noise as of EuRoC's IMU; every other run in a room starts from rest. The observations go to the
+estimator without images, the start included.
 """
 from __future__ import annotations
 
@@ -40,15 +41,20 @@ class World:
     seconds: float
     pixel_sigma: float  # px, of the observations; the estimator is told
     lines: bool
-    points: int = 600  # in the room; about a sixth is in view at a time
+    place: str = 'room'  # or 'corridor'
+    points: int = 600  # in it; about a sixth is in view at a time
+    in_view: int = MAX_POINTS  # points used at a time, at most
     options: Options = field(default_factory=Options)
 
     def sequence(self) -> Simulated:
         rng = np.random.default_rng((self.seed, 1))
         gyro_bias, accel_bias = GYRO_BIAS * rng.normal(size=3), ACCEL_BIAS * rng.normal(size=3)
-        motion, room = Trajectory.random(self.seed, REST_S * (self.seed % 2)), Room.random(self.seed, self.points)
+        if self.place == 'corridor':
+            motion, room = Trajectory.walk(self.seed), Room.corridor(self.seed, self.points)
+        else:
+            motion, room = Trajectory.random(self.seed, REST_S * (self.seed % 2)), Room.random(self.seed, self.points)
         return Simulated(motion, room, calibration(), self.seconds, pixel_sigma=self.pixel_sigma, seed=self.seed,
-                         gyro_bias=tuple(gyro_bias), accel_bias=tuple(accel_bias))
+                         max_points=self.in_view, gyro_bias=tuple(gyro_bias), accel_bias=tuple(accel_bias))
 
 
 @dataclass

@@ -85,8 +85,8 @@ def _last(values: list[float]) -> float:
     return next((v for v in reversed(values) if np.isfinite(v)), float('nan'))
 
 
-def consistency_section(levels: Sequence[Level], seconds: float, points: int) -> str:
-    """Accuracy against noise, and NEES."""
+def consistency_section(levels: Sequence[Level], what: str) -> str:
+    """Accuracy against noise, and NEES; what: one line about the runs."""
     accuracy = [[f'{v.pixel_sigma:g}', _with(v), str(v.runs), str(len(v.failures)),
                  *(number(_quantile(v.ate_m, q), '.4f') for q in (0.5, 0.9, 1.0)),
                  number(_mean(v.ate_m), '.4f')] for v in levels]
@@ -94,7 +94,7 @@ def consistency_section(levels: Sequence[Level], seconds: float, points: int) ->
                '{:.2f} to {:.2f}'.format(*v.bounds[name]), number(v.average[name], '.2f')]
               for v in levels for name in v.at_end]
     failures = [f'- {v.pixel_sigma:g} px, {_with(v)}: {reason}' for v in levels for reason in v.failures]
-    parts = [EXPLANATION, f'Runs of {seconds:g} s in rooms of {points} points and 120 lines:',
+    parts = [EXPLANATION, f'{what}:',
              table(['noise, px', 'with', 'runs', 'failed', 'ATE median, m', 'ATE 90 %, m', 'ATE max, m', 'ATE mean, m'],
                    accuracy),
              table(['noise, px', 'with', 'quantity', 'freedom', 'NEES at the end', '95 % bounds', 'average'], honest)]

@@ -90,8 +90,12 @@ def _add_consistency(kinds: Any) -> None:
     parser.add_argument('--first-seed', type=int, default=0, metavar='N', help='seeds N, N + 1, ...; default 0')
     parser.add_argument('--pixel-sigma', type=float, nargs='+', default=[0.3], metavar='PX',
                         help='noise of the observations, px; several: ATE against noise; default 0.3')
+    parser.add_argument('--place', choices=('room', 'corridor'), default='room',
+                        help='a room with a random motion in it, or a walk along a corridor; default room')
     parser.add_argument('--points', type=_positive, default=600, metavar='N',
-                        help='in the room, of which a sixth is in view at a time; default 600')
+                        help='in that place, of which a sixth is in view at a time; default 600')
+    parser.add_argument('--points-in-view', type=_positive, default=700, metavar='N',
+                        help='points used at a time, at most: fewer to see what lines can do alone; default 700')
     parser.add_argument('--lines', action=argparse.BooleanOptionalAction, default=None,
                         help='with or without lines only; default: both')
     parser.add_argument('--jobs', type=_positive, default=1, metavar='N', help='processes at a time, default 1')

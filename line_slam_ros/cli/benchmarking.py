@@ -41,15 +41,19 @@ def consistency(args: argparse.Namespace) -> int:
     args.output.mkdir(parents=True, exist_ok=True)
     seeds = range(args.first_seed, args.first_seed + args.runs)
     kinds = [(sigma, lines) for sigma in args.pixel_sigma for lines in (True, False) if args.lines in (None, lines)]
-    worlds = [World(seed, args.seconds, sigma, lines, args.points) for sigma, lines in kinds for seed in seeds]
+    worlds = [World(seed, args.seconds, sigma, lines, args.place, args.points, args.points_in_view)
+              for sigma, lines in kinds for seed in seeds]
     os.environ.update(ONE_THREAD)  # for the processes to come
     traces = list(tqdm(simulate_all(worlds, args.jobs), total=len(worlds), unit='run', dynamic_ncols=True))
     levels = [consistency_report.level_of(traces[k * args.runs:(k + 1) * args.runs]) for k in range(len(kinds))]
-    document = {'seconds': args.seconds, 'points': args.points, 'first_seed': args.first_seed,
+    document = {'place': args.place, 'seconds': args.seconds, 'points': args.points,
+                'points_in_view': args.points_in_view, 'first_seed': args.first_seed,
                 'levels': [asdict(v) for v in levels]}
     (args.output / 'consistency.json').write_text(evaluation.json_text(document), encoding='utf-8')
     consistency_report.plot(args.output / 'consistency.png', levels)
-    _publish(args, 'consistency', consistency_report.consistency_section(levels, args.seconds, args.points))
+    what = (f'Runs of {args.seconds:g} s in a {args.place} of {args.points} points and lines, at most '
+            f'{args.points_in_view} points used at a time')
+    _publish(args, f'consistency in a {args.place}', consistency_report.consistency_section(levels, what))
     return 0 if any(len(v.failures) < v.runs for v in levels) else 1
 
 

@@ -16,6 +16,7 @@ from line_slam_ros.geometry.line_forms import unit_world_lines
 from line_slam_ros.types import F64, I64, Calibration, LineForm, Observations, RigCorrection, Samples
 
 MAX_GYRO_BIAS, MAX_ACCEL_BIAS, MAX_SPEED = 0.5, 2.5, 50.0  # rad/s, m/s^2, m/s: beyond, the estimate is nonsense
+UNDAMPED = 1e-7  # damping too small to matter
 MIN_FEATURES = 6  # fewer that an earlier state saw, too, and the camera is blind
 
 
@@ -105,7 +106,12 @@ class Estimator:
         return RigCorrection(float(np.degrees(np.linalg.norm(rig[:3]))), float(np.linalg.norm(rig[3:6])), float(rig[6]))
 
     def covariance(self) -> F64:
-        """(9, 9) of the newest state's [rotation in B, position in W, velocity in W], as of the last linearisation."""
+        """(9, 9) of the newest state's [rotation in B, position in W, velocity in W].
+
+        By the equations of the last step, or by fresh ones when those were damped: damping is no knowledge.
+        """
+        if self.solver.linearised_with > UNDAMPED:
+            self.linearise()
         return self.solver.covariance(self.window.n - 1)[:9, :9]
 
     def last_good(self) -> tuple[F64, F64] | None:

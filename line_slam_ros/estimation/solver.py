@@ -130,7 +130,7 @@ class Solver:
         self._a_p, self._a_l = np.zeros((rows_p, 3)), np.zeros((rows_l, 4))
         self._step_p, self._step_l = np.zeros((rows_p, 3)), np.zeros((rows_l, 4))
         self.chi2_points, self.chi2_lines = np.zeros((rows_p, slots)), np.zeros((rows_l, slots))
-        self._damping = 1e-6
+        self._damping, self.linearised_with = 1e-6, 0.0  # linearised_with: damping that H and the landmarks' A hold
 
     def linearise(self, use_points, use_lines, damping: float = 0.0, links: tuple[int, int] | None = None) -> None:
         """Fill H (15 n, 15 n) and g from the chosen landmarks, the prior, links [first, last) and their rests.
@@ -145,6 +145,7 @@ class Solver:
         add_links(first, last, w.R, w.p, w.v, w.b, w.R0, w.p0, w.v0, w.b0, w.dt, w.dR, w.dp, w.dv, w.J_b, w.b_lin,
                   w.W, w.w_b, o.g_W, self.H, self.g)
         self._add_rest(first, last, n if links is None else last)
+        self.linearised_with = damping
         self._expose()
         exposures(n, w.R0, w.p0, w.v, w.rates, w.delay[0], self._R0, self._p0, self._twist)
         t, rig = w.points, self._rig()
