@@ -3,7 +3,8 @@ from __future__ import annotations
 
 import pytest
 
-from line_slam_ros.nodes.health import Latency, Recent, Stream
+from line_slam_ros.nodes.health import Latency, Recent, Stream, refinement
+from line_slam_ros.types import RigCorrection
 
 
 def test_rate_counts_arrivals_since_the_last_measurement() -> None:
@@ -46,3 +47,9 @@ def test_recent_sentences_are_forgotten_in_time() -> None:
     assert recent.sentences() == ['second']
     recent.add('first')
     assert sorted(recent.sentences()) == ['first', 'second']
+
+
+def test_refinement_of_the_calibration_is_told_in_degrees_and_milliseconds():
+    assert refinement(None) == {}
+    assert refinement(RigCorrection(0.123, 0.0045, -0.00512)) == {
+        'camera to IMU': 'refined by 0.12 deg, 4.5 mm', 'time offset': 'refined by -5.12 ms'}

@@ -59,6 +59,8 @@ def test_metrics(output):
     assert metrics['frames'] == 60
     assert metrics['estimates'] == len((output / 'trajectory.tum').read_text().splitlines())
     assert metrics['lines'] == len(read_csv(output / 'lines.csv'))
+    rig = metrics['rig']
+    assert rig.keys() == {'rotation_deg', 'shift_m', 'delay_s'} and 0.0 < rig['rotation_deg'] < 0.5
     assert [change['status'] for change in metrics['status_changes']][:2] == ['initialising', 'tracking']
     total = metrics['stages_ms']['total']
     assert 0 < total['p50'] <= total['p95'] <= total['max'] and total['count'] == 60

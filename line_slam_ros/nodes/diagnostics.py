@@ -10,7 +10,7 @@ from typing import Protocol
 import rclpy
 from rclpy.node import Node
 
-from line_slam_ros.nodes.health import Latency, Recent
+from line_slam_ros.nodes.health import Latency, Recent, refinement
 from line_slam_ros.nodes.inputs import Inputs
 from line_slam_ros.nodes.publishers import NO_EVENTS
 from line_slam_ros.shell_config import ShellConfig
@@ -74,19 +74,12 @@ class Diagnostics:
         warnings = list(self._warnings(now))
         values |= {'frames processed': f'{latency.frames / seconds:.1f} Hz', 'poses': f'{poses / seconds:.1f} Hz',
                    'resets': str(self._resets), 'executor CPU': f'{100 * (cpu - self._cpu_then) / seconds:.0f} %',
-                   **self._calibration(), **latency.summary(),
+                   **refinement(self._rig), **latency.summary(),
                    **{f'dropped: {reason}': str(n) for reason, n in self._drops.items()}}
         self._then, self._cpu_then = now, cpu
         stamp = self._node.get_clock().now().nanoseconds
         self._publisher.publish(outputs.diagnostics(self._new, stamp, self._status, self.waiting_for, values,
                                                     self._node.get_name(), warnings))
-
-    def _calibration(self) -> dict[str, str]:
-        """What was refined of it, for people."""
-        rig = self._rig
-        return {} if rig is None else {
-            'camera to IMU': f'refined by {rig.rotation_deg:.2f} deg, {1e3 * rig.shift_m:.1f} mm',
-            'time offset': f'refined by {1e3 * rig.delay_s:.2f} ms'}
 
     def _warnings(self, now: float) -> Iterator[str]:
         yield from filter(None, (self._inputs.problem,))

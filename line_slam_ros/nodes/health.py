@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+from line_slam_ros.types import RigCorrection
+
 Clock = Callable[[], float]
 
 
@@ -58,6 +60,13 @@ class Latency:
         """'latency <stage>' -> mean and worst, for people."""
         return {f'latency {stage}': f'{1e3 * total / self.frames:.1f} ms, worst {1e3 * self.worst[stage]:.1f} ms'
                 for stage, total in self.total.items()}
+
+
+def refinement(rig: RigCorrection | None) -> dict[str, str]:
+    """What was refined of the calibration, for people; nothing where none is."""
+    return {} if rig is None else {
+        'camera to IMU': f'refined by {rig.rotation_deg:.2f} deg, {1e3 * rig.shift_m:.1f} mm',
+        'time offset': f'refined by {1e3 * rig.delay_s:.2f} ms'}
 
 
 class Recent:
