@@ -3,4 +3,4 @@
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/setup_env.sh"
 cd "$ROOT"
-exec python -m pytest --numprocesses 2 --dist loadfile --timeout 300 "$@"
+exec python -m pytest --numprocesses 2 --dist loadfile --timeout 900 "$@"
