@@ -103,10 +103,10 @@ def checked_rigid(matrix: Any, where: str) -> F64:
 
 def read_mapping(path: Path | str) -> dict[str, Any]:
     """A YAML mapping; tolerates the %YAML:1.0 line of OpenCV and EuRoC files."""
-    text = Path(path).read_text(encoding='utf-8')
     try:
+        text = Path(path).read_text(encoding='utf-8')
         document = yaml.safe_load('\n'.join(line for line in text.splitlines() if not line.startswith('%YAML')))
-    except yaml.YAMLError as error:
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
         raise ValueError(f'{path}: not readable as YAML: {" ".join(str(error).split())}') from None
     if type(document) is not dict:
         raise ValueError(f'{path}: is no calibration file; expected a Kalibr camchain-imucam.yaml or imu.yaml')

@@ -26,19 +26,27 @@ Covering = dict[tuple[str, Key], list[tuple[str, str]]]  # (kind of mark, its ar
 
 
 def marks_of(source: str, file: str) -> Iterator[tuple[str, Key, str]]:
-    """(kind, argument, test) of every mark of ours on the functions of a test module.
+    """(kind, argument, test) of every mark of ours in a test module.
 
-    ValueError for an argument that is not a literal.
+    ValueError for one that does not decorate a test, and for an argument that is not a literal.
     """
-    for node in ast.walk(ast.parse(source)):
-        for mark in node.decorator_list if isinstance(node, ast.FunctionDef) else ():
-            kind = ast.unparse(mark.func if isinstance(mark, ast.Call) else mark).removeprefix('pytest.mark.')
-            if kind not in LISTED:
-                continue
-            arguments = mark.args if isinstance(mark, ast.Call) else []
-            if not arguments or not all(isinstance(a, ast.Constant) for a in arguments):
-                raise ValueError(f'{file}:{mark.lineno}: mark {kind} of {node.name} needs literal arguments')
-            yield from ((kind, argument.value, node.name) for argument in arguments)
+    tree = ast.parse(source)
+    decorating = {mark.func if isinstance(mark, ast.Call) else mark: (mark, test.name) for test in ast.walk(tree)
+                  if isinstance(test, ast.FunctionDef) and test.name.startswith('test_')
+                  for mark in test.decorator_list}
+    for node in filter(is_ours, ast.walk(tree)):
+        if node not in decorating:
+            raise ValueError(f'{file}:{node.lineno}: mark {node.attr} must be a decorator of a function test_*')
+        mark, test = decorating[node]
+        arguments = mark.args if isinstance(mark, ast.Call) else []
+        if not arguments or not all(isinstance(a, ast.Constant) for a in arguments):
+            raise ValueError(f'{file}:{mark.lineno}: mark {node.attr} of {test} needs literal arguments')
+        yield from ((node.attr, argument.value, test) for argument in arguments)
+
+
+def is_ours(node: ast.AST) -> bool:
+    """Whether it reads pytest.mark.row or another kind of LISTED, however pytest was imported."""
+    return isinstance(node, ast.Attribute) and node.attr in LISTED and ast.unparse(node.value).endswith('mark')
 
 
 def covering(folder: Path = TESTS) -> Covering:

@@ -1,7 +1,7 @@
-"""A segment and the cameras around it: what tests of line geometry look at."""
+"""Segments and the cameras around them: what tests of line geometry look at."""
 import numpy as np
 
-from line_slam_ros.geometry.lie import rigid, rigid_inverse, transform_points
+from line_slam_ros.geometry.lie import rigid, rigid_inverse, so3_exp, transform_points
 
 FOCAL = 460.0  # px
 
@@ -37,3 +37,17 @@ def clipped(rng):
         s, t = np.sort(rng.uniform(0.05, 0.95, 2))
         return [(0.0, t), (s, 1.0), (s, t), (s, t), (s, t), (s, t)][k % 6]
     return part
+
+
+def walk(frames):
+    """Poses T_WC (F, 4, 4) that look along +z and move across it, in front of the scene."""
+    t = np.linspace(0, 1, frames)
+    p = np.stack([1.5 * np.sin(4 * t), 0.8 * np.cos(5 * t), 0.5 * t], axis=1)
+    return rigid(so3_exp(np.stack([0.1 * np.sin(6 * t), 0.1 * np.cos(4 * t), 0.3 * t], axis=1)), p)
+
+
+def scene(rng, count):
+    """Segments (L, 2, 3) four to seven metres ahead, in all directions."""
+    middle = rng.uniform([-2, -1.5, 4], [2, 1.5, 7], (count, 3))
+    half = rng.normal(size=(count, 3)) * [0.6, 0.6, 0.3]
+    return np.stack([middle - half, middle + half], axis=1)

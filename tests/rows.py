@@ -160,7 +160,7 @@ SOURCE_ERRORS = {
         'partial views at 4.5 px of a 2 m segment: {} cm by the innermost foot, {} cm by our vote', (179.0, 1.57)),
     'D2 updatelineplk break': SourceError(
         'the first bad frame ends the work on a line, and a bad host leaves its ends unset',
-        'a bad view is one vote less', 'with one bad frame of 10 to 20, whichever it is, nothing moves'),
+        'a bad view is one vote less', 'with one bad frame of 12, whichever it is, nothing moves'),
     'D2 updatelineplk 8 m': SourceError(
         'a line longer than 8 m is dropped', 'no limit of length', 'a line of 12 m is kept whole'),
     'D2 savefeatures': SourceError(

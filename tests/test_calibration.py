@@ -121,6 +121,12 @@ def test_broken_imu_files_say_what_to_do(tmp_path, old, new, says):
         read_imu_noise(write(tmp_path / 'imu.yaml', NOISE.replace(old, new)))
 
 
+def test_a_binary_file_is_named(tmp_path):
+    (tmp_path / 'c.yaml').write_bytes(b'\xff\xfe\x00cam0')
+    with pytest.raises(ValueError, match=r"c\.yaml: not readable as YAML: 'utf-8' codec can't decode byte 0xff"):
+        read_kalibr(tmp_path / 'c.yaml')
+
+
 def test_a_missing_file_is_an_os_error(tmp_path):
     with pytest.raises(FileNotFoundError):
         read_kalibr(tmp_path / 'none.yaml')

@@ -45,9 +45,9 @@ def reference(inputs, px, seed, freedom):
 
 
 @needs_house
+@pytest.mark.row(34, 35, 41)
 @pytest.mark.parametrize('joint', [True, False], ids=['joint', 'per line'])
-@pytest.mark.parametrize('freedom', [pytest.param(2, marks=pytest.mark.row(34, 41)),
-                                     pytest.param(4, marks=pytest.mark.row(35, 41))])
+@pytest.mark.parametrize('freedom', [2, 4])
 @pytest.mark.parametrize(('px', 'seed'), [(0.0, 0)] + [(px, seed) for px in (1.5, 3.0, 4.5) for seed in range(3)])
 def test_the_authors_settings_give_the_authors_costs_and_errors(px, seed, freedom, joint):
     expected, problem = reference('obs_fov', px, seed, freedom), house(px, seed)

@@ -115,6 +115,8 @@ BAD = [  # reader, text, line, complaint
     (observations, '#\n0 0 0 0 1 1\n0 1 0 0 1 1 1\n', 3, 'expected 6 numbers frame line u1 v1 u2 v2'),
     (observations, '0 0 0 0 1 1\n0 1 0 x 1 1\n', 2, '"0 1 0 x 1 1", expected 6 numbers'),
     (poses, b'0 1 2 3 0 0 0 \xff\n', 1, 'expected 8 numbers'),
+    (landmarks, b'\x7fELF\x00\x1b[2J\r\n', 1, r'"\x7fELF\x00\x1b[2J", expected 6 numbers'),
+    (observations, b'\x00' * 500, 1, '"' + 20 * r'\x00' + '", expected'),  # 80 characters
     (poses, POSE.format(0) + POSE.format('nan'), 2, 'NaN or infinity'),
     (landmarks, '\n0 0 0 1 inf 0\n', 2, 'NaN or infinity, expected finite numbers x1'),
     (observations, '0 0 0 0 1 NaN\n', 1, 'NaN or infinity'),
@@ -204,10 +206,17 @@ def test_noise_has_the_standard_deviation_asked_for():
 
 
 @pytest.mark.row(38)
-@pytest.mark.parametrize('sigma', [-0.1, np.nan, np.inf])
+@pytest.mark.parametrize('sigma', [-0.1, np.nan, np.inf, 1e308, 1001.0])
 def test_noise_that_is_no_standard_deviation_is_refused(sigma):
-    with pytest.raises(ValueError, match='noise must be 0 or a positive standard deviation'):
+    with pytest.raises(ValueError, match='noise must be a standard deviation from 0 to 1000'):
         add_noise(random_views(), sigma, 0)
+
+
+@pytest.mark.row(38)
+def test_the_most_noise_is_added_and_a_seed_below_zero_refused():
+    assert np.isfinite(add_noise(random_views(), 1000.0, 0).ends).all()
+    with pytest.raises(ValueError, match='seed must be 0 or more, got -1'):
+        add_noise(random_views(), 0.0, -1)
 
 
 @pytest.mark.row(38)

@@ -1,6 +1,7 @@
 """The line map: trimming from many views, quality, merging, bounded memory."""
 import numpy as np
 import pytest
+from line_scene import clipped, looking, see, views
 
 from line_slam_ros.config import Mapping
 from line_slam_ros.geometry.lie import rigid_inverse
@@ -10,22 +11,10 @@ from line_slam_ros.mapping.line_map import VIEWS, LineMap
 from line_slam_ros.mapping.table import IdTable
 from line_slam_ros.mapping.trimming import _foot
 
-FOCAL = 460.0  # px
-
 
 @pytest.fixture
 def rng():
     return np.random.default_rng(11)
-
-
-def looking(eye, target):
-    """T_WC of a camera at eye that looks at target."""
-    z = (target - eye) / np.linalg.norm(target - eye)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x /= np.linalg.norm(x)
-    T_WC = np.eye(4)
-    T_WC[:3, :3], T_WC[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), eye
-    return T_WC
 
 
 def pluecker_through(a, b):
@@ -42,21 +31,17 @@ def covariance(a, b, sigma):
     return sigma**2 * J @ J.T
 
 
-def see(line_map, rng, line_id, a, b, views, px=0.0, part=lambda k: (0.0, 1.0), distance=4.0):
-    """Feed observations of the parts of a segment from random places in front of it; ends in random order."""
-    centre = (a + b) / 2
-    for k in range(views):
-        T_WC = looking(centre + rng.uniform([-1.5, -distance - 1, -1], [1.5, -distance, 1]), centre)
-        p_C = (np.stack([a + s * (b - a) for s in part(k)]) - T_WC[:3, 3]) @ T_WC[:3, :3]
-        ends = p_C[:, :2] / p_C[:, 2:] + rng.normal(size=(2, 2)) * px / FOCAL
+def feed(line_map, rng, line_id, a, b, count, **how):
+    """Feed views of a segment, as line_scene.views makes them, with their ends in random order."""
+    for T_WC, ends in zip(*views(rng, a, b, count, **how), strict=True):
         line_map.observe(np.array([line_id]), ends[None, :: rng.choice([-1, 1])], T_WC)
 
 
-def add(line_map, rng, line_id, a, b, sigma=0.002, views=12, **how):
+def add(line_map, rng, line_id, a, b, sigma=0.002, count=12, **how):
     a, b = np.asarray(a, float), np.asarray(b, float)
     line_map.refine(np.array([line_id]), pluecker_through(a, b)[None], covariance(a, b, sigma)[None],
-                    np.array([views]))
-    see(line_map, rng, line_id, a, b, views, **how)
+                    np.array([count]))
+    feed(line_map, rng, line_id, a, b, count, **how)
 
 
 def end_error(segments, a, b):
@@ -68,14 +53,6 @@ def end_error(segments, a, b):
     return np.linalg.norm(ends - [a, b], axis=1).mean()
 
 
-def clipped(rng):
-    """One view in six reaches the first end, one in six the second, the rest neither."""
-    def part(k):
-        s, t = np.sort(rng.uniform(0.05, 0.95, 2))
-        return [(0.0, t), (s, 1.0), (s, t), (s, t), (s, t), (s, t)][k % 6]
-    return part
-
-
 A, B = np.array([-1.0, 4.0, 0.2]), np.array([1.0, 4.5, 0.6])
 
 
@@ -85,7 +62,7 @@ A, B = np.array([-1.0, 4.0, 0.2]), np.array([1.0, 4.5, 0.6])
 @pytest.mark.parametrize('px, tolerance', [(0.0, 1e-9), (1.0, 0.006), (4.5, 0.03)])
 def test_full_views_give_the_ends_however_they_are_ordered(rng, px, tolerance):
     line_map = LineMap(Mapping())
-    add(line_map, rng, 3, A, B, views=30, px=px)
+    add(line_map, rng, 3, A, B, count=30, px=px)
     assert end_error(line_map.segments(), A, B) <= tolerance
 
 
@@ -95,7 +72,7 @@ def test_full_views_give_the_ends_however_they_are_ordered(rng, px, tolerance):
 @pytest.mark.parametrize('px, tolerance', [(0.0, 0.01), (1.0, 0.02), (4.5, 0.06)])
 def test_clipped_views_give_the_ends_that_few_of_them_reach(rng, px, tolerance):
     line_map = LineMap(Mapping())
-    add(line_map, rng, 3, A, B, views=48, px=px, part=clipped(rng))
+    add(line_map, rng, 3, A, B, count=48, px=px, part=clipped(rng))
     assert end_error(line_map.segments(), A, B) <= tolerance
 
 
@@ -116,7 +93,7 @@ def test_the_compiled_foot_is_that_of_the_geometry_module(rng):
 @pytest.mark.source_error('D2 updatelineplk break')
 def test_one_bad_frame_moves_nothing(rng):
     line_map = LineMap(Mapping())
-    add(line_map, rng, 3, A, B, views=10, part=lambda k: (-0.8, 1.9) if k == 4 else (0.0, 1.0))
+    add(line_map, rng, 3, A, B, count=10, part=lambda k: (-0.8, 1.9) if k == 4 else (0.0, 1.0))
     assert end_error(line_map.segments(), A, B) < 1e-9
 
 
@@ -125,7 +102,7 @@ def test_one_bad_frame_moves_nothing(rng):
 @pytest.mark.trap('near end-on views')
 def test_feet_behind_the_camera_and_along_the_line_are_not_used(rng):
     line_map = LineMap(Mapping())
-    add(line_map, rng, 3, A, B, views=8)
+    add(line_map, rng, 3, A, B, count=8)
     away = looking(np.array([0.0, 0.0, 0.0]), np.array([0.0, -4.0, 0.0]))
     direction = (B - A) / np.linalg.norm(B - A)
     end_on = looking(A - 3 * direction + [0.0, 0.0, 0.05], B)
@@ -140,7 +117,7 @@ def test_feet_behind_the_camera_and_along_the_line_are_not_used(rng):
 def test_a_line_of_twelve_metres_is_kept_whole(rng):
     a, b = np.array([-6.0, 7.0, 0.0]), np.array([6.0, 7.0, 0.0])
     line_map = LineMap(Mapping())
-    add(line_map, rng, 0, a, b, views=20, px=0.5, distance=7.0)
+    add(line_map, rng, 0, a, b, count=20, px=0.5, distance=7.0)
     line_map.retire(np.array([0]))
     assert end_error(line_map.segments(), a, b) < 0.05
 
@@ -148,19 +125,19 @@ def test_a_line_of_twelve_metres_is_kept_whole(rng):
 def test_ends_follow_a_refined_estimate(rng):
     line_map = LineMap(Mapping())
     further = 1.3
-    add(line_map, rng, 0, A, B, views=12)
-    views = line_map._active['poses'][0, :12].copy()
+    add(line_map, rng, 0, A, B, count=12)
+    poses = line_map._active['poses'][0, :12].copy()
     line_map.refine(np.array([0]), -pluecker_through(further * A, further * B)[None],
                     covariance(further * A, further * B, 0.001)[None], np.array([12]))
     ends = line_map.segments().ends[0]
-    centre = views[:, :, 3].mean(axis=0)
+    centre = poses[:, :, 3].mean(axis=0)
     expected = centre + (np.stack([A, B]) - centre) * np.linalg.norm(further * A - centre) / np.linalg.norm(A - centre)
     assert np.linalg.norm(np.diff(ends, axis=0)) > 1.15 * np.linalg.norm(B - A)  # the same rays, further out
     np.testing.assert_allclose(ends, expected, atol=0.25)
     assert (ends[1] - ends[0]) @ (B - A) > 0  # a direction turned round by the estimator does not swap the ends
 
 
-@pytest.mark.parametrize('change', [{'sigma': 0.2}, {'views': 3}, {'part': lambda k: (0.5, 0.51)}])
+@pytest.mark.parametrize('change', [{'sigma': 0.2}, {'count': 3}, {'part': lambda k: (0.5, 0.51)}])
 def test_doubtful_lines_are_neither_shown_nor_kept(rng, change):
     line_map = LineMap(Mapping())
     add(line_map, rng, 0, A, B, **change)
@@ -173,9 +150,8 @@ def test_a_line_without_parallax_is_not_shown(rng):
     line_map = LineMap(Mapping())
     line_map.refine(np.array([0]), pluecker_through(A, B)[None], covariance(A, B, 1e-3)[None], np.array([9]))
     T_WC = looking(np.zeros(3), (A + B) / 2)
-    p_C = (np.stack([A, B]) - T_WC[:3, 3]) @ T_WC[:3, :3]
     for _ in range(9):
-        line_map.observe(np.array([0]), (p_C[:, :2] / p_C[:, 2:])[None], T_WC)
+        line_map.observe(np.array([0]), see(T_WC, A, B)[None], T_WC)
     assert len(line_map.segments()) == 0
 
 
@@ -183,7 +159,7 @@ def test_retired_lines_stay_and_their_views_are_forgotten(rng):
     line_map = LineMap(Mapping())
     for k in range(300):
         offset_k = np.array([0.0, 0.0, 0.2 * k])
-        add(line_map, rng, k, A + offset_k, B + offset_k, views=4)
+        add(line_map, rng, k, A + offset_k, B + offset_k, count=4)
         line_map.retire(np.array([k, 10_000]))
     assert len(line_map.segments()) == 300 and len(line_map.active()) == 0
     assert len(line_map._active._ids) == 64  # rows of the active table, allocated once
@@ -191,7 +167,7 @@ def test_retired_lines_stay_and_their_views_are_forgotten(rng):
 
 def test_views_of_a_long_track_are_bounded_and_spread_over_its_life(rng):
     line_map = LineMap(Mapping())
-    add(line_map, rng, 0, A, B, views=5)
+    add(line_map, rng, 0, A, B, count=5)
     for k in range(1000):
         T_WC = np.eye(4)
         T_WC[0, 3] = k
@@ -218,7 +194,7 @@ def test_duplicates_become_one_better_line(rng):
 
 def test_a_crooked_piece_beside_a_line_is_merged_without_bending_it(rng):
     line_map, middle, along = LineMap(Mapping()), (A + B) / 2, (B - A) / np.linalg.norm(B - A)
-    add(line_map, rng, 1, A, B, sigma=0.002, views=30)
+    add(line_map, rng, 1, A, B, sigma=0.002, count=30)
     crooked = 0.1 * (along + [0, 0, np.tan(np.radians(4))])  # 4 degrees off in 20 cm, surer of it than it should be
     add(line_map, rng, 2, middle - crooked, middle + crooked, sigma=0.001)
     line_map.retire(np.array([1, 2]))
@@ -268,7 +244,7 @@ def test_the_same_calls_give_the_same_map():
         rng, line_map = np.random.default_rng(2), LineMap(Mapping())
         for k in range(60):
             a = rng.uniform([-2, 3, -1], [2, 5, 1])
-            add(line_map, rng, k, a, a + rng.normal(size=3) + [1, 0, 0], px=1.0, views=6)
+            add(line_map, rng, k, a, a + rng.normal(size=3) + [1, 0, 0], px=1.0, count=6)
             if k % 3 == 2:
                 line_map.retire(np.array([k - 2, k - 1]))
         return line_map.segments()

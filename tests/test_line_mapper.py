@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from line_scene import FOCAL, scene, walk
 
 from line_slam_ros.config import Config
 from line_slam_ros.estimation.line_mapper import LineEstimator, LineMapper
@@ -20,7 +21,6 @@ from line_slam_ros.types import (
     Status,
 )
 
-FOCAL = 460.0
 SIGMA = 1.0 / FOCAL
 T_BC = rigid(so3_exp([0.2, -0.4, 1.5]), [0.05, -0.02, 0.03])
 EVERY = dict.fromkeys(LINE_FORMS, (0.02, 0.08)) | {'host': (0.06, 0.3)}  # form -> largest mean, max error across, m
@@ -35,20 +35,6 @@ def config_of(form='orthonormal', **mapping):
     config = Config()
     return replace(config, estimator=replace(config.estimator, line_representation=form),
                    mapping=replace(config.mapping, **mapping))
-
-
-def walk(count):
-    """Camera poses T_WC (N, 4, 4) that look along +z and move about in front of the scene."""
-    t = np.linspace(0, 1, count)
-    p = np.stack([1.5 * np.sin(4 * t), 0.8 * np.cos(5 * t), 0.5 * t], axis=1)
-    return rigid(so3_exp(np.stack([0.1 * np.sin(6 * t), 0.1 * np.cos(4 * t), 0.3 * t], axis=1)), p)
-
-
-def scene(rng, count):
-    """Segments (L, 2, 3) four to seven metres ahead."""
-    middle = rng.uniform([-2, -1.5, 4], [2, 1.5, 7], (count, 3))
-    half = rng.normal(size=(count, 3)) * [0.6, 0.6, 0.3]
-    return np.stack([middle - half, middle + half], axis=1)
 
 
 def observed(lines, T_WC, rng, px=0.0, ids=None):
@@ -182,7 +168,7 @@ def test_lines_contradicted_by_most_views_are_forgotten(rng):
 
 
 def test_memory_is_bounded_and_lines_that_left_are_kept(rng):
-    config = config_of()
+    config = config_of(max_sigma_m=0.1)
     estimator, line_map = LineEstimator(config), LineMap(config.mapping)
     for k in range(30):
         lines = scene(rng, 8) + [8.0 * k, 0, 0]

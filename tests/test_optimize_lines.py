@@ -4,6 +4,8 @@ import json
 
 import numpy as np
 import pytest
+from line_scene import FOCAL, scene, walk
+from matplotlib.figure import Figure
 
 from line_slam_ros.cli.main import main
 from line_slam_ros.experiment.files import (
@@ -16,7 +18,7 @@ from line_slam_ros.experiment.files import (
     write_observations,
     write_poses,
 )
-from line_slam_ros.geometry.lie import rigid, rigid_inverse, so3_exp, transform_points
+from line_slam_ros.geometry.lie import rigid_inverse, transform_points
 
 PNG = b'\x89PNG\r\n\x1a\n'
 
@@ -24,22 +26,17 @@ PNG = b'\x89PNG\r\n\x1a\n'
 @pytest.fixture
 def house(tmp_path):
     """Eight segments seen in 40 frames; line 3 in one frame only, line 5 never."""
-    rng = np.random.default_rng(3)
-    t = np.linspace(0, 1, 40)
-    T_WC = rigid(so3_exp(np.stack([0.1 * np.sin(6 * t), 0.1 * t, 0.3 * t], axis=1)),
-                 np.stack([1.5 * np.sin(4 * t), 0.8 * np.cos(5 * t), 0.5 * t], axis=1))
-    middle, half = rng.uniform([-2, -1.5, 4], [2, 1.5, 7], (8, 3)), rng.normal(size=(8, 3)) * [0.6, 0.6, 0.3]
-    segments = np.stack([middle - half, middle + half], axis=1)
+    T_WC, segments = walk(40), scene(np.random.default_rng(3), 8)
     frame, line = (a.ravel() for a in np.mgrid[:40, :8])
     seen = (line != 5) & ((line != 3) | (frame == 7))
     p_C = transform_points(rigid_inverse(T_WC)[frame], segments[line])
     views = LineViews(frame[seen], line[seen], (p_C[..., :2] / p_C[..., 2:])[seen])
     folder = tmp_path / 'house'
     folder.mkdir()
-    write_poses(folder / POSES, t, T_WC)
+    write_poses(folder / POSES, np.arange(40) / 30, T_WC)
     write_landmarks(folder / LANDMARKS, segments)
     write_observations(folder / OBSERVATIONS, views)
-    write_observations(folder / 'noisy.txt', add_noise(views, 2.0 / 460, 9))
+    write_observations(folder / 'noisy.txt', add_noise(views, 2.0 / FOCAL, 9))
     return folder
 
 
@@ -135,7 +132,10 @@ def test_a_sweep_tells_cost_iterations_time_and_errors_of_both_modes(optimize, c
     assert at_2_px['host_free joint']['cost'] == pytest.approx(at_2_px['orthonormal joint']['cost'], rel=1e-5)
     assert (output / 'sweep.png').read_bytes().startswith(PNG)
     printed = capsys.readouterr().out.splitlines()
-    assert len(printed) == 13 and len({len(line) for line in printed}) == 1  # aligned
+    table, failures = printed[:13], printed[13:]
+    assert len({len(line) for line in table}) == 1  # aligned
+    assert failures == [f'failed  {float(row["noise_px"]):g} px, seed {row["seed"]}, {row["method"]}: line {line}: '
+                        'seen in fewer than 2 frames' for row in runs for line in (3, 5)]
 
 
 @pytest.mark.row(38, 41)
@@ -161,6 +161,27 @@ def test_options_change_single_settings_of_a_preset(optimize):
         'ends': 'quantile', 'end_share': 0.2}
 
 
+def test_lines_of_less_parallax_than_asked_for_are_not_started(optimize):
+    _, output = optimize('--observations', 'noisy.txt', '--min-parallax-deg', 89)
+    reasons = [row['reason'] for row in rows_of(output / 'lines.csv')]
+    few, flat = 'seen in fewer than 2 frames', 'no parallax: all planes within 89 deg'
+    assert reasons == [few if i in (3, 5) else flat for i in range(8)]
+
+
+def test_the_sweep_shows_every_marker_and_plain_numbers(optimize, monkeypatch):
+    sheets = []
+    monkeypatch.setattr(Figure, 'savefig', lambda sheet, *_, **__: sheets.append(sheet))
+    optimize('--noise-px', 1, 2, '--sigma-px', 2, figure=True)
+    sheets[0].canvas.draw()
+    *errors, trade_off = sheets[0].axes
+    low, high = trade_off.get_xlim()
+    seconds = [x for line in trade_off.lines for x in line.get_xdata()]
+    assert low == 0.0 < min(seconds) and max(seconds) == pytest.approx(high / 1.1)
+    for axes in (*errors, trade_off):
+        texts = [label.get_text() for label in axes.get_yticklabels(which='both') if label.get_text()]
+        assert axes.get_yscale() == 'log' and len(texts) > 1 and all(float(text) > 0.0 for text in texts)
+
+
 def test_several_forms_are_compared_without_noise_too(optimize):
     code, output = optimize('--form', 'host', 'orth4', '--observations', 'noisy.txt')
     assert code == 0
@@ -169,7 +190,8 @@ def test_several_forms_are_compared_without_noise_too(optimize):
 
 @pytest.mark.parametrize(('words', 'message'), [
     (('--observations', 'none.txt'), 'none.txt'), (('--sigma-px', '0'), 'sigma_px must be positive and finite'),
-    (('--noise-px', '-1'), 'noise must be'), (('--iterations', '0'), 'at least one iteration is needed'),
+    (('--noise-px', '-1'), 'noise must be'), (('--noise-px', '1e308'), 'noise must be'),
+    (('--seeds', '-1'), 'seed must be 0 or more, got -1'), (('--iterations', '0'), 'at least one iteration is needed'),
     (('--end-share', '0.9'), 'end_share must lie in')])
 def test_bad_settings_and_files_give_one_line_and_exit_code_2(optimize, capsys, words, message):
     code, _ = optimize(*words)

@@ -61,6 +61,19 @@ def test_marks_are_read_in_every_form_they_take() -> None:
                                                      ('trap', 'near', 'test_one'), ('row', 4, 'test_two')]
 
 
+@pytest.mark.parametrize('source', [
+    '@pytest.mark.parametrize("x", [pytest.param(1, marks=pytest.mark.row(3))])\ndef test_one(x): ...\n',
+    'pytestmark = pytest.mark.row(3)\n\n\ndef test_one(): ...\n',
+    'pytestmark = [pytest.mark.trap("near")]\n\n\ndef test_one(): ...\n',
+    'covers = pytest.mark.row\n\n\n@covers(3)\ndef test_one(): ...\n',
+    '@mark.source_error("D1")\ndef helper(): ...\n',
+    '@pytest.mark.row(3)\ndef helper(): ...\n',
+    '@pytest.mark.row(3)\nclass TestMore:\n    def test_two(self): ...\n'])
+def test_a_mark_that_does_not_decorate_a_test_is_refused(source: str) -> None:
+    with pytest.raises(ValueError, match=r'f.py:1: mark (row|trap|source_error) must be a decorator of a function'):
+        list(writer.marks_of(source, 'f.py'))
+
+
 @pytest.mark.parametrize('mark', ['row', 'row()', 'row(N)', 'row(3, N)'])
 def test_a_mark_that_cannot_be_read_is_an_error(mark: str) -> None:
     with pytest.raises(ValueError, match='f.py:1: mark row of test_one needs literal arguments'):

@@ -44,7 +44,7 @@ def assert_found(segments, a, b, atol):
     ('along x through the origin', [-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]), ('upright', [0.3, 4.0, -1.0], [0.3, 4.0, 1.0])])
 def test_lines_at_the_singularities_of_the_angles_are_mapped_exactly(rng, name, a, b):
     a, b = np.array(a), np.array(b)
-    assert_found(mapped(*views(rng, a, b, 12)), a, b, 1e-6)
+    assert_found(mapped(*views(rng, a, b, 12), max_sigma_m=0.1), a, b, 1e-6)
 
 
 def refined(U, phi, T_WC, ends, steps=20):
@@ -108,7 +108,7 @@ def test_views_from_one_plane_make_no_line(rng, along, ahead, px):
 @pytest.mark.trap('one bad frame')
 @pytest.mark.source_error('D2 updatelineplk break')
 @pytest.mark.row(32)
-@pytest.mark.parametrize('bad', [0, 5, 11])
+@pytest.mark.parametrize('bad', range(12))
 def test_a_bad_view_changes_nothing_wherever_it_comes_also_first(rng, bad):
     T_WC, ends = views(rng, A, B, 12)
     ends[::3] = ends[::3, ::-1]

@@ -23,7 +23,7 @@ from line_slam_ros.cli.benchmark_runs import ONE_THREAD, run_recording
 def recordings(args: argparse.Namespace) -> int:
     """0 if at least one run gave poses. results.json is written after every run."""
     wanted = chosen(read_suite(args.file), args.only, args.variants)
-    args.output.mkdir(parents=True, exist_ok=True)
+    _prepare(args)
     path = args.output / 'results.json'
     old, new, speed_ms = read_rows(path) if args.keep else [], [], machine_ms()
     for recording in wanted:
@@ -38,7 +38,7 @@ def recordings(args: argparse.Namespace) -> int:
 
 def consistency(args: argparse.Namespace) -> int:
     """0 if at least one run came through."""
-    args.output.mkdir(parents=True, exist_ok=True)
+    _prepare(args)
     seeds = range(args.first_seed, args.first_seed + args.runs)
     kinds = [(sigma, lines) for sigma in args.pixel_sigma for lines in (True, False) if args.lines in (None, lines)]
     worlds = [World(seed, args.seconds, sigma, lines, args.place, args.points, args.points_in_view)
@@ -59,11 +59,18 @@ def consistency(args: argparse.Namespace) -> int:
 
 def lines(args: argparse.Namespace) -> int:
     """Always 0: bad input is a ValueError."""
-    args.output.mkdir(parents=True, exist_ok=True)
+    _prepare(args)
     speed = line_speed.measure(line_speed.problem(args.directory), args.repeats)
     (args.output / 'lines.json').write_text(evaluation.json_text(asdict(speed)), encoding='utf-8')
     _publish(args, 'lines', line_speed.lines_section(speed))
     return 0
+
+
+def _prepare(args: argparse.Namespace) -> None:
+    """Makes the output directory. ValueError, before anything is measured, if the Markdown file cannot be made."""
+    args.output.mkdir(parents=True, exist_ok=True)
+    if args.markdown and not args.markdown.parent.is_dir():
+        raise ValueError(f'{args.markdown}: its directory {args.markdown.parent} is missing; make it first')
 
 
 def _publish(args: argparse.Namespace, name: str, section: str) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
 from line_slam_ros.experiment.score import Errors
@@ -49,10 +50,26 @@ def save_sweep(path: Path, runs: Sequence[Run]) -> None:
             own = [run for run in runs if run.method == name]
             axes.plot([run.noise_px for run in own], [scale * getattr(run, figure) for run in own], alpha=0.7,
                       **style[name])
-        axes.set(xlabel='noise [px]', ylabel=label, yscale='log', title='mean over lines and seeds')
+        axes.set(xlabel='noise [px]', ylabel=label, title='mean over lines and seeds')
+        _set_log(axes, 'y')
         axes.grid(alpha=0.3)
     _draw_trade_off(sheet.add_subplot(1, 4, 4), runs, style)
     sheet.savefig(path, dpi=100, metadata={'Software': None})
+
+
+class _Plain(LogFormatter):
+    """Labels the ticks that its base class would, with plain numbers: 0.6 for 6 x 10^-1."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        return f'{x:g}' if super().__call__(x, pos) else ''
+
+
+def _set_log(axes: Any, which: str) -> None:
+    """Makes the axis 'x' or 'y' logarithmic."""
+    axes.set(**{f'{which}scale': 'log'})
+    axis = getattr(axes, f'{which}axis')
+    axis.set_major_formatter(_Plain())
+    axis.set_minor_formatter(_Plain())
 
 
 def _sheet(width: float, height: float) -> Figure:
@@ -78,7 +95,8 @@ def _draw_lines(axes: Any, segments: F64, ends: F64) -> None:
 
 
 def _draw_distribution(axes: Any, errors: Errors) -> None:
-    axes.set(title='share of lines with a smaller error', xscale='log', xlabel='angle [deg], distances [cm]')
+    axes.set(title='share of lines with a smaller error', xlabel='angle [deg], distances [cm]')
+    _set_log(axes, 'x')
     for values, label in ((errors.angle_deg, 'angle'), (100 * errors.perpendicular_m, 'perpendicular'),
                           (100 * errors.endpoint_m, 'end points')):
         known = np.sort(values[np.isfinite(values) & (values > 0.0)])
@@ -94,7 +112,7 @@ def _draw_trade_off(axes: Any, runs: Sequence[Run], style: dict[str, dict[str, A
         if run.noise_px == highest:
             axes.plot([run.solve_s], [100 * run.endpoint_m_mean], linestyle='none', markersize=9, **style[run.method])
     axes.set(title=f'trade-off at {highest:g} px', xlabel='time to solve [s]', ylabel='end points [cm]',
-             yscale='log')
-    axes.set_xlim(left=0.0)
+             xlim=(0.0, 1.1 * max(run.solve_s for run in runs if run.noise_px == highest)))
+    _set_log(axes, 'y')
     axes.grid(alpha=0.3)
     axes.legend()

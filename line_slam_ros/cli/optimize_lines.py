@@ -127,13 +127,13 @@ def _sweep(experiment: Experiment, methods: Mapping[str, Method], asked: dict[st
     from line_slam_ros.experiment.sweep import means, sweep
     runs = sweep(experiment, methods, asked['noise_px'], asked['seeds'])
     mean = means(runs)
-    write_csv(output / 'sweep.csv', [asdict(run) for run in runs])
+    write_csv(output / 'sweep.csv', [{k: v for k, v in asdict(run).items() if k != 'failed'} for run in runs])
     _write_json(output / 'sweep.json', {**asked, 'methods': {name: _plain(method) for name, method in methods.items()},
                                         'runs': [asdict(run) for run in runs], 'means': [asdict(run) for run in mean]})
     if figure:
         from line_slam_ros.cli import line_figures
         line_figures.save_sweep(output / 'sweep.png', mean)
-    print('\n'.join(sweep_table(mean)))
+    print('\n'.join([*sweep_table(mean), *sweep_failures(runs)]))
 
 
 def line_rows(problem: LineProblem, result: Result, errors: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -141,6 +141,7 @@ def line_rows(problem: LineProblem, result: Result, errors: Mapping[str, Any]) -
     coordinates = 'x1_m', 'y1_m', 'z1_m', 'x2_m', 'y2_m', 'z2_m'
     return [{'id': i, 'reason': str(reason), 'views': int(problem.count[i]),
              'outliers': int(result.outliers[i]), 'cost': float(result.cost[i]), 'iterations': int(result.steps[i]),
+             'converged': bool(result.converged[i]),
              **dict(zip(coordinates, result.ends[i].ravel().tolist(), strict=True)),
              **{name: float(values[i]) for name, values in errors.items()}} for i, reason in enumerate(result.reason)]
 
@@ -155,10 +156,11 @@ def line_table(rows: Iterable[Mapping[str, Any]]) -> list[str]:
 
 def summary_table(run: Run) -> list[str]:
     """The figures of one run as rows of name and value."""
-    rows = [('method', run.method), ('lines', f'{run.lines - run.failures} of {run.lines}'),
+    rows = [('method', run.method), ('lines', f'{run.lines - run.failures:g} of {run.lines}'),
             ('outliers', f'{run.outliers} views over the gate'),
             ('cost', f'{run.cost:.10g} at sigma {run.sigma_px:.4g} px'),
-            ('iterations', run.iterations), ('time', f'{run.start_s:.3f} s to start, {run.solve_s:.4f} s to solve'),
+            ('iterations', f'{run.iterations}' + _unconverged(run)),
+            ('time', f'{run.start_s:.3f} s to start, {run.solve_s:.4f} s to solve'),
             ('angle', f'{run.angle_deg_mean:.4f} deg mean, {run.angle_deg_max:.4f} max'),
             ('perpendicular', f'{100 * run.perpendicular_m_mean:.4f} cm mean, {100 * run.perpendicular_m_max:.4f} max'),
             ('end points', f'{100 * run.endpoint_m_mean:.4f} cm mean, {100 * run.endpoint_m_max:.4f} max')]
@@ -179,6 +181,20 @@ def sweep_table(runs: Iterable[Run]) -> list[str]:
          f'{run.iterations:g}', f'{run.solve_s:.4f}', f'{run.angle_deg_mean:.4f}', f'{run.angle_deg_max:.4f}',
          f'{100 * run.perpendicular_m_mean:.4f}', f'{100 * run.perpendicular_m_max:.4f}',
          f'{100 * run.endpoint_m_mean:.4f}', f'{100 * run.endpoint_m_max:.4f}') for run in runs])
+
+
+def sweep_failures(runs: Iterable[Run]) -> list[str]:
+    """Every line without an answer, and every method that ran out of steps."""
+    lines = []
+    for run in runs:
+        where = f'{run.noise_px:g} px, seed {run.seed}, {run.method}'
+        lines += [f'failed  {where}: line {line}: {reason}' for line, reason in run.failed.items()]
+        lines += [f'note    {where}:{_unconverged(run)}'] if run.unconverged else []
+    return lines
+
+
+def _unconverged(run: Run) -> str:
+    return f' ({run.unconverged:g} lines used all the steps they may take: --iterations)' if run.unconverged else ''
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -20,6 +20,8 @@ from line_slam_ros.types import F64, I64
 
 POSES, LANDMARKS, OBSERVATIONS = 'cam_pose_tum.txt', 'house.txt', 'observations.txt'
 QUATERNION_LENGTHS = (1e-6, 1e6)  # outside, a quaternion is no rounded unit quaternion but a mistake
+MOST_NOISE = 1e3  # normalised; far wider than any image
+SHOWN = 80  # characters of a row in a message
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,9 +108,12 @@ def add_noise(views: LineViews, sigma: float, seed: int) -> LineViews:
     """The views with Gaussian noise of standard deviation sigma (normalised) on all four coordinates.
 
     Drawn row by row for all views: same seed, same bytes, and a part of the rows must be taken after the noise.
+    ValueError for a sigma not from 0 to MOST_NOISE or a negative seed.
     """
-    if not 0.0 <= sigma < np.inf:
-        raise ValueError(f'noise must be 0 or a positive standard deviation, got {sigma}')
+    if not 0.0 <= sigma <= MOST_NOISE:
+        raise ValueError(f'noise must be a standard deviation from 0 to {MOST_NOISE:g} (normalised), got {sigma:g}')
+    if seed < 0:
+        raise ValueError(f'seed must be 0 or more, got {seed}')
     noise = np.random.default_rng(seed).normal(0.0, 1.0, (len(views.line), 4)) * sigma
     return LineViews(views.frame, views.line, views.ends + noise.reshape(-1, 2, 2))
 
@@ -150,7 +155,8 @@ class _Table:
                 try:
                     self._checked([row])
                 except ValueError:
-                    raise ValueError(f'{self.path}:{number}: "{row.strip()[:80]}", '
+                    shown = repr(row.strip()[:SHOWN])[1:-1][:SHOWN]  # control characters escaped
+                    raise ValueError(f'{self.path}:{number}: "{shown}", '
                                      f'expected {self.columns} numbers {self.names}') from None
             raise
 

@@ -65,5 +65,7 @@ class LineProblem:
         """What belongs to each view (M, ...) as a table (L, K, ...) of K views at most; rows beyond count repeat the
         line's last view."""
         count = self.count
+        if not len(views):
+            return np.zeros((len(count), 1, *views.shape[1:]))
         columns = np.minimum(np.arange(max(1, count.max(initial=1))), np.maximum(count, 1)[:, None] - 1)
         return views[np.minimum(self.first[:, None] + columns, len(views) - 1)]

@@ -15,8 +15,11 @@ from line_slam_ros.geometry.line_forms import VALUES, store_lines, unit_world_li
 from line_slam_ros.types import F64, I64, LineSegments, Loss
 
 FEW_VIEWS = 'too few views besides the host'
+CONTRADICTED = 'most of its views contradict it'
 NOT_HELD = 'the form cannot hold it'
 LEAST_SIGMA_PX = 1e-4  # that the residuals are believed
+AGREEING = 0.5  # share of the views that must lie within the gate
+SIGMA_ROUNDS, SIGMA_SETTLED = 20, 1e-8  # fits until sigma changes by less than this part of it
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +30,7 @@ class Result:
     ends: F64  # (L, 2, 3) m
     cost: F64  # (L,) half the sum of the losses of the line's views
     steps: I64  # (L,) Levenberg-Marquardt steps taken, in all fits together
+    converged: np.ndarray  # (L,) bool, False where the last fit used all the steps it may take
     outliers: I64  # (L,) views over the gate, which do not count
     reason: np.ndarray  # (L,) of str, '' for a line with an answer
     sigma_px: float  # that weighed the residuals
@@ -62,14 +66,27 @@ def solve_lines(problem: LineProblem, method: Method) -> Result:
     rows, values, reason = store(problem, method, starts)
     lines = len(reason)
     pluecker, cost, steps = np.full((lines, 6), np.nan), np.full(lines, np.nan), np.zeros(lines, np.int64)
+    converged = np.zeros(lines, bool)
     fitted = fit(problem, method, rows, values)
-    cost[rows], steps[rows] = fitted.cost, fitted.steps
+    agreeing = rows[~_contradicted(problem, method, fitted.counted)[rows]]
+    reason[np.setdiff1d(rows, agreeing)] = CONTRADICTED
+    steps[rows], converged[rows] = fitted.steps, fitted.steps_last < method.iterations
+    cost[rows] = fitted.cost
     pluecker[rows] = unit_world_lines(int(method.form), values, problem.origin()[rows])[0]
+    cost[reason == CONTRADICTED], pluecker[reason == CONTRADICTED] = np.nan, np.nan
     counted = problem.only(fitted.counted)
     ends = find_ends(counted, pluecker, method.ends, method.end_share, fitted.sigma)
     reason[(reason == '') & np.isnan(ends).any(axis=(1, 2))] = NO_ENDS
-    return Result(pluecker, ends, cost, steps, problem.count - counted.count, reason, fitted.sigma * method.focal,
-                  start_s, fitted.seconds)
+    return Result(pluecker, ends, cost, steps, converged, problem.count - counted.count, reason,
+                  fitted.sigma * method.focal, start_s, fitted.seconds)
+
+
+def _contradicted(problem: LineProblem, method: Method, counted: np.ndarray) -> np.ndarray:
+    """Lines (L,) of whose views too few count: not more than fix it, or not most."""
+    counts = np.arange(len(counted)) >= _first(problem, method)[problem.line]
+    used = np.bincount(problem.line[counts], minlength=len(problem.first))
+    left = np.bincount(problem.line[counts & counted], minlength=len(problem.first))
+    return (left < used) & ((2 * left <= method.form.freedom) | (left <= AGREEING * used))
 
 
 def store(problem: LineProblem, method: Method, starts: Starts) -> tuple[I64, F64, np.ndarray]:
@@ -93,6 +110,7 @@ class Fit:
 
     cost: F64  # (N,)
     steps: I64  # (N,)
+    steps_last: I64  # (N,) of the last fit alone
     sigma: float  # normalised
     counted: np.ndarray  # (M,) bool, False for views over the gate
     seconds: float
@@ -111,15 +129,19 @@ def fit(problem: LineProblem, method: Method, rows: I64, values: F64) -> Fit:
     started = perf_counter()
     if method.sigma_px is None:
         sigma = _scatter(problem, search, rows, values)
-        steps += _descend(problem, search, rows, values, sigma, counted)[1]
-        sigma = _scatter(problem, search, rows, values)
+        for _ in range(SIGMA_ROUNDS):
+            before = sigma
+            steps += _descend(problem, search, rows, values, sigma, counted)[1]
+            sigma = _scatter(problem, search, rows, values)
+            if abs(sigma - before) <= SIGMA_SETTLED * before:
+                break
     else:
         sigma = method.sigma_px / method.focal
     if method.gate is not None:
         steps += _descend(problem, search, rows, values, sigma, counted)[1]
         counted = ~(_distances2(problem, search, rows, values) > method.gate * sigma**2)
     cost, last = _descend(problem, method, rows, values, sigma, counted)
-    return Fit(cost, steps + last, sigma, counted, perf_counter() - started)
+    return Fit(cost, steps + last, last, sigma, counted, perf_counter() - started)
 
 
 def _descend(problem: LineProblem, method: Method, rows: I64, values: F64, sigma: float,

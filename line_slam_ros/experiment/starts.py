@@ -31,6 +31,7 @@ from line_slam_ros.geometry.lines import (
 from line_slam_ros.types import F64
 
 PAIRS, JUDGES = 64, 64  # tried by consensus, and views that judge them
+TOGETHER = 100  # lines judged at a time, to bound memory
 IN_FRONT = 0.5  # share of the feet that must lie in front of their cameras
 FEW_FRAMES, NO_PARALLAX, BEHIND = 'seen in fewer than 2 frames', 'no parallax', 'behind the cameras'
 
@@ -87,14 +88,21 @@ def _stacked(problem: LineProblem, planes: F64) -> F64:
 def _from_consensus(problem: LineProblem, planes: F64) -> F64:
     """Of random pairs of planes the line (L, 6) for which the median angle is least between the observation planes and
     those that the line itself has with the cameras. Same views, same pairs."""
-    first, count, last = problem.first[:, None], problem.count[:, None], len(planes) - 1
+    parts = [slice(k, k + TOGETHER) for k in range(0, len(problem.first), TOGETHER)]
+    return np.concatenate([_judged(problem, planes, part) for part in parts])
+
+
+def _judged(problem: LineProblem, planes: F64, part: slice) -> F64:
+    """_from_consensus for some of the lines."""
+    first, count, last = problem.first[part, None], problem.count[part, None], len(planes) - 1
     choice = np.random.default_rng(0).random((2, PAIRS))
     i, j = (np.minimum(first + (u * count).astype(np.int64), last) for u in choice)
     lines = line_from_planes(planes[i], planes[j])
     judges = np.minimum(first + (np.linspace(0.0, 1.0, JUDGES, endpoint=False) * count).astype(np.int64), last)
-    centre = problem.poses[judges, :, 3] - problem.origin()[:, None]
+    centre = problem.poses[judges, :, 3] - problem.origin()[part, None]
     n = lines[:, :, None, :3] - np.cross(centre[:, None], lines[:, :, None, 3:])  # (L, PAIRS, JUDGES, 3)
-    cosine2 = np.einsum('lpvi,lvi->lpv', n, planes[judges, :3]) ** 2 / np.sum(n * n, axis=-1)
+    with np.errstate(invalid='ignore'):  # no plane holds the camera and a line through its centre
+        cosine2 = np.einsum('lpvi,lvi->lpv', n, planes[judges, :3]) ** 2 / np.sum(n * n, axis=-1)
     agreement = np.median(np.nan_to_num(cosine2), axis=-1)
     return lines[np.arange(len(lines)), np.argmax(agreement, axis=1)]
 

@@ -23,6 +23,7 @@ NEAREST = 0.1  # m, depth at which a line comes into view
 SHORTEST = 20.0  # px, length of a segment in the image that a detector would still report
 EYE = 1.6  # m, mean height of the camera
 LEAST_PART = 0.2  # of a visible segment that a partial view shows
+MOST_NOISE_PX = 1e6  # far wider than any image
 BODY = 22  # lines of the house besides its windows
 WALLS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # outward normals
 ALONG = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])  # level, in the wall
@@ -86,26 +87,26 @@ class Effects:
     swapped: float = 0.0  # share of views with their two ends in the other order
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.noise_px < math.inf:
-            raise ValueError(f'noise must be 0 px or more, got {self.noise_px}')
+        if not 0.0 <= self.noise_px <= MOST_NOISE_PX:
+            raise ValueError(f'noise must lie from 0 to {MOST_NOISE_PX:g} px, got {self.noise_px:g}')
         for name in ('partial', 'outliers', 'swapped'):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f'{name} is a share and must lie from 0 to 1, got {getattr(self, name)}')
 
 
 def random_house(seed: int, lines: int = 80) -> F64:
-    """Segments (L, 2, 3) of a house, L = lines but at least BODY.
+    """Segments (lines, 2, 3) of a house. ValueError for fewer than BODY, without which it is none.
 
     Edges of floor, eaves and gable roof, a door, stair rails, up to eight windows, and for the rest pictures, pipes
     and shelves: single lines on the walls or in front of them.
     """
-    if lines < 1:
-        raise ValueError(f'a house needs at least 1 line, got {lines}')
+    if lines < BODY:
+        raise ValueError(f'a house needs at least {BODY} lines, got {lines}')
     rng = _stream(seed, Purpose.WORLD)
     size = rng.uniform([7.0, 7.0, 3.0], [10.0, 10.0, 4.0])  # m, in x, in y and height of the walls
-    windows = min(int(rng.integers(4, 9)), max(lines - BODY, 0) // 4)
+    windows = min(int(rng.integers(4, 9)), (lines - BODY) // 4)
     parts = [_edges(size, size[2] + rng.uniform(1.2, 2.5)), _openings(rng, size, windows), _stair_rails(rng, size)]
-    parts.append(_single_lines(rng, size, max(lines - sum(map(len, parts)), 0)))
+    parts.append(_single_lines(rng, size, lines - sum(map(len, parts))))
     return np.concatenate(parts) @ so3_exp(rng.uniform(0.0, 2.0 * np.pi) * UP).T
 
 
