@@ -22,8 +22,8 @@ and heading are known only relative to the start, so the truth is moved to the e
 heading (four numbers) before errors are taken; ATE is evo's, after SE(3) alignment. NEES per degree of freedom is 1 if
 the covariance is right and more if it is too small; its mean over the runs, at their end, lies within the 95 % bounds
 if the runs are independent and the covariance is right. The average over time has no such bounds: it is correlated.
-Of lines, those good enough for the map count, by their offset across at both true ends. Their covariance holds the
-poses fixed: seen from the newest pose, that pose's own error is taken out."""
+Of lines, those good enough for the map count, by their offset across at both true ends. Their covariance is that
+as the newest camera knows them: seen from the newest pose, that pose's own error is taken out."""
 
 
 @dataclass(frozen=True, slots=True)

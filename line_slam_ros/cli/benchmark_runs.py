@@ -18,6 +18,7 @@ from line_slam_ros.cli.results import TumWriter
 from msg_adapters import sensors
 
 ONE_THREAD = dict.fromkeys(('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS', 'NUMBA_NUM_THREADS'), '1')
+IN_ORDER = {'PYTHONUNBUFFERED': '1'}  # of what a command says on both streams, the last word comes last
 
 
 def run_recording(recording: Recording, output: Path, timeout_s: float) -> Iterator[Row]:
@@ -84,7 +85,7 @@ def _line_slam(words: Sequence[Any], log: Path, timeout_s: float) -> tuple[int, 
     command = [sys.executable, '-m', 'line_slam_ros.cli.main', *map(str, words)]
     with log.open('w', encoding='utf-8') as stream:
         done = subprocess.run(command, stdout=stream, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, check=False,
-                              env=os.environ | ONE_THREAD, timeout=timeout_s)
+                              env=os.environ | ONE_THREAD | IN_ORDER, timeout=timeout_s)
     lines = [line for line in re.split(r'[\r\n]+', log.read_text(encoding='utf-8', errors='replace')) if line.strip()]
     return done.returncode, lines[-1] if lines else ''
 
