@@ -146,3 +146,11 @@ def test_the_command_writes_json_tables_and_plot(tmp_path):
         assert len(v['over_time']['pose']) == len(v['t_s']) == 4
     assert '| 1 | points | pose | 6 |' in out and '| 1 | points | pose | 6 |' in (tmp_path / 'page.md').read_text()
     assert (tmp_path / 'consistency.png').stat().st_size > 10_000
+
+
+def test_lines_that_noise_alone_would_start_do_not_lose_a_walk_along_a_corridor():
+    """Most lines there are short in the image or parallel to the motion."""
+    trace = simulate(World(2, 8.0, 0.5, True, 'corridor', points=1500, in_view=25))
+    assert not trace.failure
+    error = [estimated[:3, 3] - true[:3, 3] for estimated, true in zip(trace.T_EB, trace.true_T_EB, strict=True)]
+    assert np.linalg.norm(error, axis=1).max() < 0.15

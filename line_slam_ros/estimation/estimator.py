@@ -205,7 +205,7 @@ class Estimator:
                      p.p_WA, o.rho0, o.w_rho, p.solved)
         todo = ~q.solved[:q.count] & (q.seen[:q.count].sum(axis=1) >= self.options.line_min_views)
         min_sine = np.sin(np.radians(self.options.line_min_parallax_deg))
-        start_lines(n, R, position, w.R_BC, w.p_BC, todo, q.seen, q.z, min_sine,
+        start_lines(n, R, position, w.R_BC, w.p_BC, todo, q.seen, q.z, q.sigma, min_sine,
                     int(o.line_form), q.values, q.origin, q.solved)
 
     def _cull(self) -> tuple[I64, I64]:

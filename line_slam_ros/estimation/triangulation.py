@@ -4,6 +4,8 @@ from numba import njit
 
 from line_slam_ros.geometry.line_forms import store_line
 
+SIGNIFICANT = 5.0  # standard deviations of an angle between observation planes that noise does not explain
+
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def camera_pose(R_WB, p_WB, R_BC, p_BC, R_WC, p_WC):
@@ -56,16 +58,16 @@ def start_points(n, R, p, R_BC, p_BC, todo, seen, z, sigma, abr, R_WA, p_WA, rho
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def start_lines(n, R, p, R_BC, p_BC, todo, seen, z, min_sine, form, values, origin, solved):
+def start_lines(n, R, p, R_BC, p_BC, todo, seen, z, sigma, min_sine, form, values, origin, solved):
     """Lines of the rows in todo, in any form (geometry/line_forms.py), from all observation planes (multi-view SVD).
 
     Every view's plane (n_j, -n_j . p_j) holds the line, so the two smallest eigenvectors of the sum
-    of their outer products span it. Rows stay unsolved when no two planes meet at more than
-    asin(min_sine) (motion along the line, in its plane, or too short), an observed end lies behind a camera, or the
-    form cannot hold the line.
+    of their outer products span it. Rows stay unsolved when no two planes meet at more than asin(min_sine) and than
+    their noise explains (motion along the line, in its plane, or too short), an observed end lies behind a camera, or
+    the form cannot hold the line.
     """
     R_WC, p_WC, h, nd = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(6)
-    normals, planes = np.empty((n, 3)), np.empty(4)
+    normals, planes, noise2 = np.empty((n, 3)), np.empty(4), np.empty(n)
     for i in range(len(todo)):
         if not todo[i]:
             continue
@@ -84,11 +86,12 @@ def start_lines(n, R, p, R_BC, p_BC, todo, seen, z, min_sine, form, values, orig
                 planes[k] = s * (R_WC[k, 0] * h[0] + R_WC[k, 1] * h[1] + R_WC[k, 2] * h[2])
                 normals[views, k] = planes[k]
                 planes[3] -= planes[k] * (p_WC[k] - origin[i, k])
+            noise2[views] = (sigma[i, f, 0] ** 2 + sigma[i, f, 1] ** 2) / ((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2)
             views += 1
             for k in range(4):
                 for j in range(4):
                     M[k, j] += planes[k] * planes[j]
-        if views < 2 or _widest(normals, views) < min_sine:
+        if views < 2 or not _has_parallax(normals, noise2, views, min_sine):
             continue
         _, V = np.linalg.eigh(M)
         if _line_through(V[:, 0], V[:, 1], nd) and _in_front(n, R, p, R_BC, p_BC, seen[i], z[i], nd, origin[i]):
@@ -98,14 +101,18 @@ def start_lines(n, R, p, R_BC, p_BC, todo, seen, z, min_sine, form, values, orig
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def _widest(normals, views):
-    """Largest sine between two of the unit normals (views, 3), blind to their signs."""
-    least = 1.0
+def _has_parallax(normals, noise2, views, min_sine):
+    """Whether two of the unit normals (views, 3), blind to their signs, differ by more than min_sine and significantly.
+
+    noise2 (views,): variance (rad^2) of a normal about its bearing, from the noise of the ends over the length.
+    """
     for j in range(views):
         for k in range(j):
-            c = abs(normals[j, 0] * normals[k, 0] + normals[j, 1] * normals[k, 1] + normals[j, 2] * normals[k, 2])
-            least = min(least, c)
-    return np.sqrt(max(0.0, 1.0 - least * least))
+            c = normals[j, 0] * normals[k, 0] + normals[j, 1] * normals[k, 1] + normals[j, 2] * normals[k, 2]
+            sine2 = 1.0 - c * c
+            if sine2 >= min_sine * min_sine and sine2 >= SIGNIFICANT**2 * (noise2[j] + noise2[k]):
+                return True
+    return False
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
