@@ -77,13 +77,7 @@ def trajectory(stamps: F64, T_WB: F64) -> PoseTrajectory3D:
 
 def score_trajectory(estimate: PoseTrajectory3D, truth: PoseTrajectory3D) -> tuple[TrajectoryScore, F64]:
     """The score and T_TE (4, 4), which takes the estimate's world to the truth's. ValueError without overlap."""
-    try:
-        true, matched = sync.associate_trajectories(truth, estimate, max_diff=MATCH)
-        aligned, scaled = copy.deepcopy(matched), copy.deepcopy(matched)
-        R_TE, p_TE, _ = aligned.align(true)
-        scale = scaled.align(true, correct_scale=True)[2]
-    except (sync.SyncException, GeometryException) as error:
-        raise ValueError(f'the trajectories cannot be compared: {error}') from None
+    true, aligned, T_TE, scale = _align(estimate, truth)
     position = _statistics(metrics.APE(PoseRelation.translation_part), true, aligned)
     rotation = _statistics(metrics.APE(PoseRelation.rotation_angle_deg), true, aligned)
     stamps = true.timestamps
@@ -94,8 +88,27 @@ def score_trajectory(estimate: PoseTrajectory3D, truth: PoseTrajectory3D) -> tup
         relative_error(true, aligned, PoseRelation.rotation_angle_deg),
         relative_error_over_path(true, aligned, PoseRelation.translation_part),
         relative_error_over_path(true, aligned, PoseRelation.rotation_angle_deg),
-        float(scale), still_drift(stamps, true.positions_xyz, aligned.positions_xyz))
-    return result, rigid(R_TE, p_TE)
+        scale, still_drift(stamps, true.positions_xyz, aligned.positions_xyz))
+    return result, T_TE
+
+
+def ate_rmse_m(estimate: PoseTrajectory3D, truth: PoseTrajectory3D) -> float:
+    """TrajectoryScore.ate_rmse_m alone, without the pairs of poses that take long. ValueError without overlap."""
+    true, aligned, _, _ = _align(estimate, truth)
+    return _statistics(metrics.APE(PoseRelation.translation_part), true, aligned)['rmse']
+
+
+def _align(estimate: PoseTrajectory3D,
+           truth: PoseTrajectory3D) -> tuple[PoseTrajectory3D, PoseTrajectory3D, F64, float]:
+    """Matched true poses, the estimated ones aligned with them, T_TE (4, 4) of this, and the scale that would fit."""
+    try:
+        true, matched = sync.associate_trajectories(truth, estimate, max_diff=MATCH)
+        aligned, scaled = copy.deepcopy(matched), copy.deepcopy(matched)
+        R_TE, p_TE, _ = aligned.align(true)
+        scale = scaled.align(true, correct_scale=True)[2]
+    except (sync.SyncException, GeometryException) as error:
+        raise ValueError(f'the trajectories cannot be compared: {error}') from None
+    return true, aligned, rigid(R_TE, p_TE), float(scale)
 
 
 def relative_error(true: PoseTrajectory3D, aligned: PoseTrajectory3D, relation: PoseRelation) -> float:

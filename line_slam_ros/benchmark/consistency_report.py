@@ -58,9 +58,8 @@ def level_of(traces: Sequence[Trace]) -> Level:
 
 def _ate(trace: Trace) -> float:
     stamps = np.array(trace.t_s)
-    score, _ = evaluation.score_trajectory(evaluation.trajectory(stamps, np.array(trace.T_EB)),
-                                           evaluation.trajectory(stamps, np.array(trace.true_T_EB)))
-    return score.ate_rmse_m
+    return evaluation.ate_rmse_m(evaluation.trajectory(stamps, np.array(trace.T_EB)),
+                                 evaluation.trajectory(stamps, np.array(trace.true_T_EB)))
 
 
 def _over_time(traces: Sequence[Trace], name: str, seconds: np.ndarray) -> F64:

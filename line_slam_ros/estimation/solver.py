@@ -267,13 +267,16 @@ class Solver:
         return [(w.R, n), (w.p, n), (w.v, n), (w.b, n), (w.R_BC, 3), (w.p_BC, 3), (w.delay, 1), (w.points.abr, p),
                 (w.lines.values, q)]
 
+    def _information(self, rows: np.ndarray) -> tuple[F64, bool]:
+        """Cholesky factor of those rows of H, for cho_solve; what nothing says anything about is held by a trace."""
+        return cho_factor(self.H[np.ix_(rows, rows)] + 1e-9 * np.eye(len(rows)), lower=True, check_finite=False)
+
     def covariance(self, slot: int) -> F64:
         """(15, 15) of one state given everything in the window; needs a fresh linearise."""
         rows, o = self.window.rows(), STATE * slot
         rhs = np.zeros((len(rows), STATE))
         rhs[o:o + STATE] = np.eye(STATE)
-        factor = cho_factor(self.H[np.ix_(rows, rows)] + 1e-9 * np.eye(len(rows)), lower=True, check_finite=False)
-        return cho_solve(factor, rhs, check_finite=False)[o:o + STATE]
+        return cho_solve(self._information(rows), rhs, check_finite=False)[o:o + STATE]
 
     def line_covariances(self, lines: np.ndarray) -> F64:
         """(L, 4, 4) of the lines in those rows, in their tangent, as the newest camera knows them; after a linearise.
@@ -291,7 +294,6 @@ class Solver:
         W[:, :, STATE * w.slots:] = self._B_l[lines]
         ties = np.zeros((len(rows), len(tied)))
         ties[np.searchsorted(rows, tied), np.arange(len(tied))] = 1.0
-        factor = cho_factor(self.H[np.ix_(rows, rows)] + 1e-9 * np.eye(len(rows)), lower=True, check_finite=False)
-        S = cho_solve(factor, ties, check_finite=False)[np.searchsorted(rows, tied)]
+        S = cho_solve(self._information(rows), ties, check_finite=False)[np.searchsorted(rows, tied)]
         AW = A @ W[:, :, tied]
         return A + AW @ S @ AW.transpose(0, 2, 1)

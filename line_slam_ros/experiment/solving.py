@@ -68,12 +68,12 @@ def solve_lines(problem: LineProblem, method: Method) -> Result:
     pluecker, cost, steps = np.full((lines, 6), np.nan), np.full(lines, np.nan), np.zeros(lines, np.int64)
     converged = np.zeros(lines, bool)
     fitted = fit(problem, method, rows, values)
-    agreeing = rows[~_contradicted(problem, method, fitted.counted)[rows]]
-    reason[np.setdiff1d(rows, agreeing)] = CONTRADICTED
+    contradicted = rows[_contradicted(problem, method, fitted.counted)[rows]]
+    reason[contradicted] = CONTRADICTED
     steps[rows], converged[rows] = fitted.steps, fitted.steps_last < method.iterations
     cost[rows] = fitted.cost
     pluecker[rows] = unit_world_lines(int(method.form), values, problem.origin()[rows])[0]
-    cost[reason == CONTRADICTED], pluecker[reason == CONTRADICTED] = np.nan, np.nan
+    cost[contradicted], pluecker[contradicted] = np.nan, np.nan
     counted = problem.only(fitted.counted)
     ends = find_ends(counted, pluecker, method.ends, method.end_share, fitted.sigma)
     reason[(reason == '') & np.isnan(ends).any(axis=(1, 2))] = NO_ENDS
