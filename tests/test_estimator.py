@@ -1,10 +1,13 @@
 """The estimator on simulated features with exact truth: starts, accuracy, marginalisation, rest, failure."""
+import copy
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pytest
 
 from line_slam_ros.config import Estimator as Options
+from line_slam_ros.estimation import solver as solver_module
 from line_slam_ros.estimation.bootstrap import Bootstrap
 from line_slam_ros.estimation.estimator import Estimator
 from line_slam_ros.estimation.initialisation import upright
@@ -136,6 +139,24 @@ def test_covariance_grows_with_distance_and_bounds_the_error(moving):
 def test_upright_takes_the_measured_up_direction_to_z():
     for up in np.random.default_rng(0).normal(size=(20, 3)).tolist() + [[0, 0, 9.8], [0, 0, -9.8]]:
         np.testing.assert_allclose(upright(np.array(up)) @ up, [0, 0, np.linalg.norm(up)], atol=1e-12)
+
+
+def test_steps_with_jacobians_taken_once_end_where_steps_with_fresh_ones_do(moving, monkeypatch):
+    estimator, _, _, _, _ = run(moving)
+    rng, w = np.random.default_rng(0), estimator.window
+    w.p[w.n - 3:w.n] += rng.normal(0.0, 0.005, (3, 3))
+    w.points.abr[:, 2] *= rng.uniform(0.97, 1.03, len(w.points.abr))
+    monkeypatch.setattr(solver_module, 'CONVERGED', 1e-6)
+    ends = []
+    for trusted in (solver_module.TRUSTED, 0.0):
+        monkeypatch.setattr(solver_module, 'TRUSTED', trusted)
+        solver = copy.deepcopy(estimator.solver)
+        with mock.patch.object(solver, '_take_jacobians', wraps=solver._take_jacobians) as taken:
+            ends.append((solver.optimise(30), solver.window.p[:w.n].copy(), taken.call_count))
+    (cost, p, few), (exact_cost, exact_p, many) = ends
+    assert few < 0.6 * many
+    assert cost == pytest.approx(exact_cost, rel=1e-4)
+    np.testing.assert_allclose(p, exact_p, atol=2e-4)
 
 
 def test_eliminating_a_state_leaves_the_solution_of_the_others():

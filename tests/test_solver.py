@@ -2,9 +2,9 @@
 import numpy as np
 import pytest
 
-from line_slam_ros.estimation.landmarks import back_substitute, retract_landmarks
+from line_slam_ros.estimation.landmarks import back_substitute, column, gather, retract_landmarks
 from line_slam_ros.estimation.solver import Solver, SolverOptions, retract_rig, retract_states
-from line_slam_ros.estimation.window import STATE, Window
+from line_slam_ros.estimation.window import RIG, Window, state_row
 from line_slam_ros.geometry.lie import so3_exp
 from line_slam_ros.geometry.line_forms import store_lines
 from line_slam_ros.geometry.lines import line_from_points
@@ -26,9 +26,9 @@ def solver(request):
         window.append(k * 200_000_000, so3_exp(0.1 * rng.normal(size=3)), [0.2 * k, 0, 0] + 0.05 * rng.normal(size=3),
                       0.1 * rng.normal(size=3), 0.01 * rng.normal(size=6), samples if k else None)
     window.still[1:3] = True
-    rows = window.rows()
-    A = rng.normal(size=(len(rows), len(rows)))
-    window.prior_H[np.ix_(rows, rows)], window.prior_g[rows] = A @ A.T, rng.normal(size=len(rows))
+    rows = window.rows
+    A = rng.normal(size=(rows, rows))
+    window.prior_H[:rows, :rows], window.prior_g[:rows] = A @ A.T, rng.normal(size=rows)
     _fill_points(window, rng)
     _fill_lines(window, rng, request.param)
     return Solver(window, SolverOptions(np.array([0.0, 0.0, -9.81]), 4.0, 4.0, request.param))
@@ -63,26 +63,24 @@ def _fill_lines(window, rng, form):
 @pytest.mark.parametrize('seed', range(4))
 def test_eliminated_normal_equations_predict_the_slope_of_the_cost(solver, seed):
     """Along any step of the states, the landmarks following: g dx - sum a' A^-1 a, exactly, robust weights and all."""
-    w, use_points, use_lines = solver.window, np.ones(POINTS, bool), np.ones(LINES, bool)
-    solver.linearise(use_points, use_lines)
-    dx, rig = np.zeros(len(solver.g)), STATE * w.slots
-    dx[:STATE * STATES] = np.tile(np.repeat([0.1, 0.01], [9, 6]), STATES)
-    dx[rig:] = RIG_SIGMA
+    w = solver.window
+    solver.linearise(np.ones(POINTS, bool), np.ones(LINES, bool))
+    dx = np.concatenate([RIG_SIGMA, np.tile(np.repeat([0.1, 0.01], [9, 6]), STATES)])
     dx *= np.random.default_rng(seed).normal(size=len(dx))
-    predicted = solver.g @ dx
-    for use, seen, size, E, B, A, a, step in (
-            (use_points, w.points.seen, 3, solver._E_p, solver._B_p, solver._A_p, solver._a_p, solver._step_p),
-            (use_lines, w.lines.seen, 4, solver._E_l, solver._B_l, solver._A_l, solver._a_l, solver._step_l)):
-        back_substitute(w.n, use, seen, size, rig, E, B, A, a, dx, step)
-        predicted -= np.einsum('ij,ijk,ik->', a, A, a)
+    columns = np.zeros(column(w.n))
+    gather(w.n, dx, columns)
+    t = solver._s + solver._S[:, :len(columns)] @ columns
+    for kind in (solver.points, solver.lines):
+        back_substitute(kind.use, kind.size, kind.L, kind.first, t, kind.step)
+    predicted = solver.g[:w.rows] @ dx - solver._s @ solver._s
     before = solver._save()
 
     def cost(part):
         solver._restore(before)
         retract_states(w.n, w.R, w.p, w.v, w.b, part * dx)
-        retract_rig(w.R_BC, w.p_BC, w.delay, part * dx[rig:])
-        retract_landmarks(use_points, w.points.abr, part * solver._step_p, use_lines,
-                          int(solver.options.line_form), w.lines.values, part * solver._step_l)
+        retract_rig(w.R_BC, w.p_BC, w.delay, part * dx[:RIG])
+        retract_landmarks(solver.points.use, w.points.abr, part * solver.points.step, solver.lines.use,
+                          int(solver.options.line_form), w.lines.values, part * solver.lines.step)
         return solver.cost()
 
     assert (cost(1e-5) - cost(-1e-5)) / 2e-5 == pytest.approx(predicted, rel=1e-6)
@@ -91,17 +89,31 @@ def test_eliminated_normal_equations_predict_the_slope_of_the_cost(solver, seed)
 def test_covariance_of_a_line_is_that_of_the_joint_equations_with_the_newest_pose_fixed(solver):
     w = solver.window
     solver.linearise(np.ones(POINTS, bool), np.ones(LINES, bool))
-    rows, newest = w.rows(), STATE * (w.n - 1)
-    kept = np.flatnonzero((rows < newest) | (rows >= newest + 6))
-    found = solver.line_covariances(np.arange(LINES))
+    kept = np.setdiff1d(np.arange(w.rows), state_row(w.n - 1) + np.arange(6))
+    found, seen = solver.line_covariances(np.arange(LINES)), np.zeros((column(w.n), w.rows))
+    gather_rows = np.concatenate([np.arange(RIG), *(state_row(k) + np.arange(6) for k in range(w.n))])
+    seen[np.arange(len(seen)), gather_rows] = 1.0
     for i in range(LINES):
-        W = np.zeros((4, len(solver.g)))
-        for slot in np.flatnonzero(w.lines.seen[i, :w.n]):
-            W[:, STATE * slot:STATE * slot + 6] = solver._E_l[i, slot]
-        W[:, STATE * w.slots:] = solver._B_l[i]
-        A_inverse, W = solver._A_l[i], W[:, rows]
-        states = solver.H[np.ix_(rows, rows)] + W.T @ A_inverse @ W  # the line not eliminated
-        joint = np.block([[states, W.T], [W, np.linalg.inv(A_inverse)]])
-        free = np.append(kept, len(rows) + np.arange(4))
+        L = np.tril(solver.lines.L[i])
+        W = L @ solver._S[solver.lines.first[i]:][:4, :len(seen)] @ seen
+        states = solver.H[:w.rows, :w.rows] + W.T @ np.linalg.inv(L @ L.T) @ W  # the line not eliminated
+        joint = np.block([[states, W.T], [W, L @ L.T]])
+        free = np.append(kept, w.rows + np.arange(4))
         expected = np.linalg.inv(joint[np.ix_(free, free)])[-4:, -4:]
         np.testing.assert_allclose(found[i], expected, atol=1e-6 * np.abs(expected).max())
+
+
+def test_a_rig_that_is_not_estimated_stays_and_the_others_do_not_see_it(solver):
+    """Its equations are those without its rows; part of a rig can be held, too."""
+    w, free = solver.window, np.array([0, 1, 2, 6])
+    use = np.ones(POINTS, bool), np.ones(LINES, bool)
+    solver.linearise(*use)
+    kept = np.concatenate([free, np.arange(RIG, w.rows)])
+    expected, g = solver.H[np.ix_(kept, kept)], solver.g[kept]
+    w.rig_sigma[3:6] = 0.0
+    solver.linearise(*use)
+    np.testing.assert_allclose(solver.H[np.ix_(kept, kept)], expected, rtol=1e-12)
+    np.testing.assert_allclose(solver.g[kept], g, rtol=1e-12)
+    before = w.p_BC.copy()
+    solver.optimise(2)
+    assert (w.p_BC == before).all()

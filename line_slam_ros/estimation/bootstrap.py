@@ -123,7 +123,7 @@ class Bootstrap:
             return (f'agreement of motion and inertial data (squared residual {inertial:.0f} per measurement, '
                     f'{MAX_INERTIAL_CHI2:.0f} allowed): keep moving')
         rows = w.points.seen[:w.points.count, :w.n].sum(axis=1) >= MIN_VIEWS
-        used = e.solver.chi2_points[:w.points.count, :w.n][rows]
+        used = e.solver.points.chi2[:w.points.count, :w.n][rows]
         used = used[used >= 0.0]
         if rows.sum() < MIN_MATCHES or np.median(used) > MAX_CHI2:
             return f'corners that can be followed: {rows.sum()} in {MIN_VIEWS} views, {MIN_MATCHES} needed'
@@ -131,7 +131,7 @@ class Bootstrap:
             return 'a plausible accelerometer bias: accelerate the camera in several directions'
         moved = w.p[w.n - 1] - w.p[0]
         e.linearise()
-        cov = e.solver.covariance(w.n - 1)[3:6, 3:6]
+        cov = e.solver.covariance()[3:6, 3:6]
         distance = max(float(np.linalg.norm(moved)), 1e-9)
         sigma = float(np.sqrt(moved @ cov @ moved)) / distance**2
         if sigma > self._options.init_max_scale_sigma:

@@ -10,7 +10,7 @@ from line_slam_ros.estimation.initialisation import Snapshot, Start
 from line_slam_ros.estimation.marginalisation import drop_state, marginalise_oldest
 from line_slam_ros.estimation.solver import Solver, SolverOptions
 from line_slam_ros.estimation.triangulation import start_lines, start_points
-from line_slam_ros.estimation.window import STATE, Window
+from line_slam_ros.estimation.window import RIG, Window, state_row
 from line_slam_ros.geometry.lie import rigid
 from line_slam_ros.geometry.line_forms import unit_world_lines
 from line_slam_ros.types import F64, I64, Calibration, LineForm, Observations, RigCorrection, Samples
@@ -74,7 +74,7 @@ class Estimator:
         R = w.R[0]  # rotation sigma is about the world axes: heading fixed, tilt free
         information[:3, :3] = R.T @ information[:3, :3] @ R
         w.freeze(np.arange(1))
-        w.prior_H[:STATE, :STATE] = information
+        w.prior_H[state_row(0):state_row(1), state_row(0):state_row(1)] = information
         self.newest_is_keyframe, self._marginalised = True, False
         self._triangulate()
 
@@ -102,7 +102,7 @@ class Estimator:
     def rig(self) -> RigCorrection:
         """How far the refined calibration is from the given one."""
         w = self.window
-        rig = w.delta(np.empty(len(w.prior_g)))[STATE * w.slots:]
+        rig = w.delta(np.empty(len(w.prior_g)))[:RIG]
         return RigCorrection(float(np.degrees(np.linalg.norm(rig[:3]))), float(np.linalg.norm(rig[3:6])), float(rig[6]))
 
     def covariance(self) -> F64:
@@ -112,7 +112,7 @@ class Estimator:
         """
         if self.solver.linearised_with > UNDAMPED:
             self.linearise()
-        return self.solver.covariance(self.window.n - 1)[:9, :9]
+        return self.solver.covariance()[:9, :9]
 
     def last_good(self) -> tuple[F64, F64] | None:
         """Position (3,) and rotation R_WB (3, 3) of the newest finite state, None when there is none."""
@@ -212,7 +212,7 @@ class Estimator:
         """Landmarks whose newest view fails the chi-square gate lose it; those mostly wrong go for good."""
         w, n = self.window, self.window.n
         gate, gone = self.options.gate_chi2, []
-        for table, chi2 in ((w.points, self.solver.chi2_points), (w.lines, self.solver.chi2_lines)):
+        for table, chi2 in ((w.points, self.solver.points.chi2), (w.lines, self.solver.lines.chi2)):
             c = table.count
             seen, solved = table.seen[:c, :n], table.solved[:c]
             bad = seen & solved[:, None] & (chi2[:c, :n] > gate)

@@ -1,294 +1,319 @@
-"""Points and lines in the normal equations, compiled: linearise, eliminate by Schur complement, step back, cost.
+"""Points and lines in the normal equations, compiled: residuals, Jacobians, elimination by Schur complement, step back.
 
-A landmark's block E (slots, d, 6) holds its Hessian with the poses, B (d, 7) that with the rig, A (d, d) its own
-(inverted once eliminated), a (d,) its gradient; d is 3 for points, 4 for lines. Everything is written into the caller's
-buffers. R, p are the bodies' poses when the images were taken, twist (n, 6) their [angular velocity in B, velocity in
-W], rig the row of the rig's first unknown in H, or negative when the rig is not estimated.
+All that a camera sees are the rig and the poses, so landmarks fill a system of their own over the columns [rig, pose
+of slot 0, pose of slot 1, ...]. For landmark i, of d numbers (3 for a point, 4 for a line), and slot f the buffers hold
+
+    chi2, weight (M, slots), pull (M, slots, 2)   squared whitened residual (-1: none), its robust weight, their product
+    at, undo (M, slots)                           where in J its Jacobian is (-1: nowhere), 1 / sqrt(weight) at that time
+    by_land (M, slots, 2, d)                      Jacobian by the landmark
+    L (M, d, d), a (M, d)                         A = L L', the landmark's own Hessian, and its gradient
+
+and J (slots, K, LANES) the Jacobians by rig and pose, slot by slot, two rows an observation, whitened and weighted. In S
+each landmark has d rows, from first[i] on: its ties W to the columns, then L^-1 W. So eliminating all of them is S' S,
+and their gradients and steps need S' s and S dx with s = L^-1 a.
+
+R, p are the bodies' poses when the images were taken, twist (n, 6) their [angular velocity in B, velocity in W].
 """
 import numpy as np
 from numba import njit
 
-from line_slam_ros.estimation.window import RIG, STATE
+from line_slam_ros.estimation.window import POSE, RIG, state_row
 from line_slam_ros.factors.line_reprojection import line_reprojection, line_residual
 from line_slam_ros.factors.point_reprojection import inverse_depth_point, point_reprojection, point_residual
 from line_slam_ros.factors.robust import CAUCHY, robust
 from line_slam_ros.geometry.line_forms import move_line, world_line
 
 BEHIND = 100.0  # cost of a point behind its camera, squared standard deviations (a rejected step, not a gradient)
+OWN = RIG + POSE  # columns that one observation depends on
+LANES = 16  # OWN and more: what processors like, the rest is zero
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def _weigh(r, sigma, c2, twist, J_pose, J_ext, scale, J_rig):
-    """Whiten r (2,) by sigma (2,) and weigh it robustly, J_pose (2, 6) alike; scale (2,) is what to multiply by.
-
-    Fills J_rig (2, 7) from J_ext (2, 6) and the motion: an image taken later by dt shows the body moved by twist dt.
-    """
-    _, w = robust(CAUCHY, (r[0] / sigma[0]) ** 2 + (r[1] / sigma[1]) ** 2, c2)
-    for k in range(2):
-        scale[k] = np.sqrt(w) / sigma[k]
-        r[k] *= scale[k]
-        J_rig[k, 6] = 0.0
-        for j in range(6):
-            J_pose[k, j] *= scale[k]
-            J_rig[k, j] = J_ext[k, j] * scale[k]
-            J_rig[k, 6] += J_pose[k, j] * twist[j]
+def column(slot):
+    """First column of a slot's pose among those that cameras see."""
+    return RIG + POSE * slot
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def _invert_spd(A, d, L):
-    """A (d, d) -> its inverse in place by Cholesky, L is scratch. False when A is not positive definite."""
-    for j in range(d):
-        s = A[j, j]
-        for k in range(j):
-            s -= L[j, k] * L[j, k]
-        if not s > 0.0:
-            return False
-        L[j, j] = np.sqrt(s)
-        for i in range(j + 1, d):
-            s = A[i, j]
-            for k in range(j):
-                s -= L[i, k] * L[j, k]
-            L[i, j] = s / L[j, j]
-    for c in range(d):  # L^-1 in the upper part of A by columns, then A = L^-T L^-1
-        for i in range(c, d):
-            s = 1.0 if i == c else 0.0
-            for k in range(c, i):
-                s -= L[i, k] * A[c, k]
-            A[c, i] = s / L[i, i]
-    for i in range(d):
-        for j in range(i, d):
-            s = 0.0
-            for k in range(j, d):
-                s += A[i, k] * A[j, k]
-            L[i, j] = s
-    for i in range(d):
-        for j in range(i, d):
-            A[i, j] = L[i, j]
-            A[j, i] = L[i, j]
-    return True
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def _add_observation(slot, rig, d, r, J_pose, J_rig, J_land, H, g, E, B, A, a):
-    """One whitened residual into the system (H, g) and into its landmark's (E, B: with state and rig, A, a)."""
-    o = STATE * slot
-    for i in range(6):
-        for j in range(6):
-            H[o + i, o + j] += J_pose[0, i] * J_pose[0, j] + J_pose[1, i] * J_pose[1, j]
-        g[o + i] += J_pose[0, i] * r[0] + J_pose[1, i] * r[1]
-        for j in range(d):
-            E[slot, j, i] = J_pose[0, i] * J_land[0, j] + J_pose[1, i] * J_land[1, j]
-    if rig >= 0:
-        for i in range(RIG):
-            for j in range(6):
-                H[o + j, rig + i] += J_pose[0, j] * J_rig[0, i] + J_pose[1, j] * J_rig[1, i]
-            for j in range(RIG):
-                H[rig + i, rig + j] += J_rig[0, i] * J_rig[0, j] + J_rig[1, i] * J_rig[1, j]
-            g[rig + i] += J_rig[0, i] * r[0] + J_rig[1, i] * r[1]
-            for j in range(d):
-                B[j, i] += J_rig[0, i] * J_land[0, j] + J_rig[1, i] * J_land[1, j]
-    for i in range(d):
-        for j in range(d):
-            A[i, j] += J_land[0, i] * J_land[0, j] + J_land[1, i] * J_land[1, j]
-        a[i] += J_land[0, i] * r[0] + J_land[1, i] * r[1]
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def _eliminate(n, seen, rig, d, damping, H, g, E, B, A, a, Y, L):
-    """Schur complement of one landmark: A becomes its inverse; H -= [E B]' A^-1 [E B] (on and above the
-    block diagonal only, see mirror), g -= [E B]' A^-1 a. False when A is singular. Y (7, d) is scratch."""
-    for i in range(d):
-        A[i, i] *= 1.0 + damping
-    if not _invert_spd(A, d, L):
-        return False
-    for f in range(n):
-        if seen[f]:
-            for i in range(6):
-                s = 0.0
-                for j in range(d):
-                    y = 0.0
-                    for m in range(d):
-                        y += E[f, m, i] * A[m, j]
-                    Y[i, j] = y
-                    s += y * a[j]
-                g[STATE * f + i] -= s
-            for h in range(f, n):
-                if seen[h]:
-                    for i in range(6):
-                        row = H[STATE * f + i]
-                        for m in range(d):
-                            y = Y[i, m]
-                            for j in range(6):
-                                row[STATE * h + j] -= y * E[h, m, j]
-            if rig >= 0:
-                _subtract(6, d, Y, B, H, STATE * f, rig)
-    if rig >= 0:
-        for i in range(RIG):
-            s = 0.0
-            for j in range(d):
-                y = 0.0
-                for m in range(d):
-                    y += B[m, i] * A[m, j]
-                Y[i, j] = y
-                s += y * a[j]
-            g[rig + i] -= s
-        _subtract(RIG, d, Y, B, H, rig, rig)
-    return True
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def _subtract(rows, d, Y, B, H, at, rig):
-    """H[at:, rig:] -= Y B for the first rows of Y (7, d), B (d, 7)."""
-    for i in range(rows):
-        row = H[at + i]
-        for m in range(d):
-            y = Y[i, m]
-            for j in range(RIG):
-                row[rig + j] -= y * B[m, j]
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def mirror(n, rig, H):
-    """Copy the pose and rig blocks above the diagonal to below it."""
-    for f in range(n):
-        if rig >= 0:
-            for i in range(6):
-                for j in range(RIG):
-                    H[rig + j, STATE * f + i] = H[STATE * f + i, rig + j]
-        for h in range(f + 1, n):
-            for i in range(6):
-                for j in range(6):
-                    H[STATE * h + j, STATE * f + i] = H[STATE * f + i, STATE * h + j]
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def add_points(n, R, p, R0, p0, R_BC, p_BC, twist, rig, use, seen, z, sigma, abr, R_WA, p_WA, c2, rho0, w_rho,
-               damping, H, g, E, B, A, a):
-    """Linearise and eliminate the points of rows with use[i]; residuals at (R, p), Jacobians at the first estimates.
+def point_residuals(n, R, p, R_BC, p_BC, use, seen, z, sigma, abr, R_WA, p_WA, c2, rho0, w_rho, chi2, pull, weight, a):
+    """Robust cost of the points of rows with use[i]; fills their chi2, pull and weight, and starts their gradients a.
 
     A weak prior of weight w_rho (m) pulls the inverse depth of unobservable points to rho0 (1/m).
-    Fills E (M, n, 3, 6), B (M, 3, 7), A (M, 3, 3) (inverses) and a (M, 3) for the back substitution.
     """
-    r, q, J_pose, J_ext, J_p = np.empty(2), np.empty(2), np.empty((2, 6)), np.empty((2, 6)), np.empty((2, 3))
-    p_W, C, J, Y, L = np.empty(3), np.empty((3, 3)), np.empty((2, 3)), np.empty((RIG, 3)), np.empty((3, 3))
-    scale, J_rig = np.empty(2), np.empty((2, RIG))
-    for i in range(len(use)):
-        A[i], a[i], B[i] = 0.0, 0.0, 0.0
-        if not use[i]:
-            continue
-        inverse_depth_point(R_WA[i], p_WA[i], abr[i], p_W, C)
-        for f in range(n):
-            E[i, f] = 0.0
-            if not seen[i, f]:
-                continue
-            if not point_residual(R[f], p[f], R_BC, p_BC, p_W, z[i, f], r):
-                continue
-            if not point_reprojection(R0[f], p0[f], R_BC, p_BC, p_W, z[i, f], q, J_pose, J_ext, J_p):
-                continue
-            _weigh(r, sigma[i, f], c2, twist[f], J_pose, J_ext, scale, J_rig)
-            for k in range(2):
-                for j in range(3):
-                    J[k, j] = scale[k] * (J_p[k, 0] * C[0, j] + J_p[k, 1] * C[1, j] + J_p[k, 2] * C[2, j])
-            _add_observation(f, rig, 3, r, J_pose, J_rig, J, H, g, E[i], B[i], A[i], a[i])
-        A[i, 2, 2] += w_rho * w_rho
-        a[i, 2] += w_rho * w_rho * (abr[i, 2] - rho0)
-        if not _eliminate(n, seen[i], rig, 3, damping, H, g, E[i], B[i], A[i], a[i], Y, L):
-            A[i] = 0.0
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def add_lines(n, R, p, R0, p0, R_BC, p_BC, twist, rig, use, seen, z, sigma, form, values, origin, c2, damping, H, g,
-              E, B, A, a):
-    """As add_points, for lines in any form (geometry/line_forms.py): E (M, n, 4, 6), B (M, 4, 7), A (M, 4, 4), a."""
-    r, q, J_pose, J_ext, J_l = np.empty(2), np.empty(2), np.empty((2, 6)), np.empty((2, 6)), np.empty((2, 6))
-    n_W, d_W, C = np.empty(3), np.empty(3), np.empty((6, 4))
-    J, Y, L, scale = np.empty((2, 4)), np.empty((RIG, 4)), np.empty((4, 4)), np.empty(2)
-    J_rig = np.empty((2, RIG))
-    for i in range(len(use)):
-        A[i], a[i], B[i] = 0.0, 0.0, 0.0
-        if not use[i]:
-            continue
-        world_line(form, values[i], origin[i], n_W, d_W, C)
-        for f in range(n):
-            E[i, f] = 0.0
-            if not seen[i, f]:
-                continue
-            if not line_residual(R[f], p[f], R_BC, p_BC, n_W, d_W, z[i, f], r):
-                continue
-            if not line_reprojection(R0[f], p0[f], R_BC, p_BC, n_W, d_W, z[i, f], q, J_pose, J_ext, J_l):
-                continue
-            _weigh(r, sigma[i, f], c2, twist[f], J_pose, J_ext, scale, J_rig)
-            for k in range(2):
-                for j in range(4):
-                    J[k, j] = 0.0
-                    for m in range(6):
-                        J[k, j] += scale[k] * J_l[k, m] * C[m, j]
-            _add_observation(f, rig, 4, r, J_pose, J_rig, J, H, g, E[i], B[i], A[i], a[i])
-        for j in range(4):
-            A[i, j, j] += 1.0  # one radian of doubt: a line without parallax stays put instead of being singular
-        if not _eliminate(n, seen[i], rig, 4, damping, H, g, E[i], B[i], A[i], a[i], Y, L):
-            A[i] = 0.0
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def back_substitute(n, use, seen, d, rig, E, B, A, a, dx, step):
-    """Landmark steps (M, d) = -A^-1 (a + [E B] dx) of the step dx of states and rig."""
-    for i in range(len(use)):
-        for j in range(d):
-            step[i, j] = 0.0
-        if not use[i]:
-            continue
-        for j in range(d):
-            s = a[i, j]
-            if rig >= 0:
-                for m in range(RIG):
-                    s += B[i, j, m] * dx[rig + m]
-            for f in range(n):
-                if seen[i, f]:
-                    for m in range(6):
-                        s += E[i, f, j, m] * dx[STATE * f + m]
-            for k in range(d):
-                step[i, k] -= A[i, k, j] * s
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def point_cost(n, R, p, R_BC, p_BC, use, seen, z, sigma, abr, R_WA, p_WA, c2, rho0, w_rho, chi2):
-    """Robust cost of the points; fills chi2 (M, n) with squared whitened residuals (-1 where unseen or behind)."""
     r, p_W, C = np.empty(2), np.empty(3), np.empty((3, 3))
     cost = 0.0
     for i in range(len(use)):
         if not use[i]:
             continue
         inverse_depth_point(R_WA[i], p_WA[i], abr[i], p_W, C)
-        cost += (w_rho * (abr[i, 2] - rho0)) ** 2
+        belief = w_rho * (abr[i, 2] - rho0)
+        cost += belief * belief
+        a[i, 0], a[i, 1], a[i, 2] = 0.0, 0.0, w_rho * belief
         for f in range(n):
-            chi2[i, f] = -1.0
+            chi2[i, f], weight[i, f] = -1.0, 0.0
+            pull[i, f, 0], pull[i, f, 1] = 0.0, 0.0
             if not seen[i, f]:
                 continue
-            if not point_residual(R[f], p[f], R_BC, p_BC, p_W, z[i, f], r):
+            if point_residual(R[f], p[f], R_BC, p_BC, p_W, z[i, f], r):
+                cost += _weigh(r, sigma, i, f, c2, chi2, pull, weight)
+            else:
                 cost += BEHIND
                 chi2[i, f] = BEHIND
-                continue
-            chi2[i, f] = (r[0] / sigma[i, f, 0]) ** 2 + (r[1] / sigma[i, f, 1]) ** 2
-            cost += robust(CAUCHY, chi2[i, f], c2)[0]
     return 0.5 * cost
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def line_cost(n, R, p, R_BC, p_BC, use, seen, z, sigma, form, values, origin, c2, chi2):
-    """Robust cost of the lines; chi2 (M, n) as in point_cost."""
+def line_residuals(n, R, p, R_BC, p_BC, use, seen, z, sigma, form, values, origin, c2, chi2, pull, weight, a):
+    """As point_residuals, for lines in any form (geometry/line_forms.py)."""
     r, n_W, d_W, C = np.empty(2), np.empty(3), np.empty(3), np.empty((6, 4))
     cost = 0.0
     for i in range(len(use)):
         if not use[i]:
             continue
         world_line(form, values[i], origin[i], n_W, d_W, C)
+        for j in range(4):
+            a[i, j] = 0.0
         for f in range(n):
-            chi2[i, f] = -1.0
+            chi2[i, f], weight[i, f] = -1.0, 0.0
+            pull[i, f, 0], pull[i, f, 1] = 0.0, 0.0
             if seen[i, f] and line_residual(R[f], p[f], R_BC, p_BC, n_W, d_W, z[i, f], r):
-                chi2[i, f] = (r[0] / sigma[i, f, 0]) ** 2 + (r[1] / sigma[i, f, 1]) ** 2
-                cost += robust(CAUCHY, chi2[i, f], c2)[0]
+                cost += _weigh(r, sigma, i, f, c2, chi2, pull, weight)
     return 0.5 * cost
+
+
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+def _weigh(r, sigma, i, f, c2, chi2, pull, weight):
+    """One residual r (2,) whitened and weighed robustly; returns its cost twice."""
+    r0, r1 = r[0] / sigma[i, f, 0], r[1] / sigma[i, f, 1]
+    square = r0 * r0 + r1 * r1
+    rho, w = robust(CAUCHY, square, c2)
+    chi2[i, f], weight[i, f] = square, w
+    pull[i, f, 0], pull[i, f, 1] = w * r0, w * r1
+    return rho
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def point_jacobians(n, R, p, R_BC, p_BC, twist, use, z, sigma, abr, R_WA, p_WA, w_rho, weight, count, J, at, undo,
+                    by_land, L, first, S):
+    """Jacobians at poses (R, p) of all observations with a weight, and the points' rows of L and S (not eliminated).
+
+    Every slot's are appended to its rows of J, of which count (slots,) are taken.
+    """
+    v, J_pose, J_rig, J_p = np.empty(2), np.empty((2, POSE)), np.empty((2, POSE)), np.empty((2, 3))
+    p_W, C = np.empty(3), np.empty((3, 3))
+    for i in range(len(use)):
+        if not use[i]:
+            continue
+        inverse_depth_point(R_WA[i], p_WA[i], abr[i], p_W, C)
+        L[i] = 0.0
+        for f in range(n):
+            at[i, f] = -1
+            if not (weight[i, f] > 0.0 and point_reprojection(R[f], p[f], R_BC, p_BC, p_W, z[i, f], v, J_pose, J_rig,
+                                                              J_p)):
+                continue
+            root = np.sqrt(weight[i, f])
+            for k in range(2):
+                scale = root / sigma[i, f, k]
+                for j in range(3):
+                    by_land[i, f, k, j] = scale * (J_p[k, 0] * C[0, j] + J_p[k, 1] * C[1, j] + J_p[k, 2] * C[2, j])
+            _append(i, f, root, sigma, twist, J_pose, J_rig, count, J, at, undo)
+            _tie(i, f, 3, J, at, by_land, L, first, S)
+        L[i, 2, 2] += w_rho * w_rho
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def line_jacobians(n, R, p, R_BC, p_BC, twist, use, z, sigma, form, values, origin, weight, count, J, at, undo, by_land,
+                   L, first, S):
+    """As point_jacobians, for lines."""
+    v, J_pose, J_rig, J_l = np.empty(2), np.empty((2, POSE)), np.empty((2, POSE)), np.empty((2, 6))
+    n_W, d_W, C = np.empty(3), np.empty(3), np.empty((6, 4))
+    for i in range(len(use)):
+        if not use[i]:
+            continue
+        world_line(form, values[i], origin[i], n_W, d_W, C)
+        L[i] = 0.0
+        for f in range(n):
+            at[i, f] = -1
+            if not (weight[i, f] > 0.0 and line_reprojection(R[f], p[f], R_BC, p_BC, n_W, d_W, z[i, f], v, J_pose,
+                                                             J_rig, J_l)):
+                continue
+            root = np.sqrt(weight[i, f])
+            for k in range(2):
+                scale = root / sigma[i, f, k]
+                for j in range(4):
+                    t = 0.0
+                    for m in range(6):
+                        t += J_l[k, m] * C[m, j]
+                    by_land[i, f, k, j] = scale * t
+            _append(i, f, root, sigma, twist, J_pose, J_rig, count, J, at, undo)
+            _tie(i, f, 4, J, at, by_land, L, first, S)
+        for j in range(4):
+            L[i, j, j] += 1.0  # one radian of doubt: a line without parallax stays put instead of being singular
+
+
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+def _append(i, f, root, sigma, twist, J_pose, J_rig, count, J, at, undo):
+    """Whiten and weigh the Jacobians (2, 6) of one observation and put them into J.
+
+    The column of the delay: an image taken later by dt shows the body moved by twist dt.
+    """
+    m = count[f]
+    count[f] = m + 2
+    at[i, f], undo[i, f] = m, 1.0 / root
+    for k in range(2):
+        scale, delay = root / sigma[i, f, k], 0.0
+        for j in range(POSE):
+            delay += J_pose[k, j] * twist[f, j]
+            J[f, m + k, j] = scale * J_rig[k, j]
+            J[f, m + k, RIG + j] = scale * J_pose[k, j]
+        J[f, m + k, RIG - 1] = scale * delay
+
+
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+def _tie(i, f, d, J, at, by_land, L, first, S):
+    """Add one observation to the Hessian (lower triangle, in L) of its landmark and to its ties, in S."""
+    m, o, row = at[i, f], RIG + POSE * f, first[i]
+    for j in range(d):
+        x, y = by_land[i, f, 0, j], by_land[i, f, 1, j]
+        for k in range(j + 1):
+            L[i, j, k] += x * by_land[i, f, 0, k] + y * by_land[i, f, 1, k]
+        for c in range(RIG):
+            S[row + j, c] += x * J[f, m, c] + y * J[f, m + 1, c]
+        for c in range(POSE):
+            S[row + j, o + c] = x * J[f, m, RIG + c] + y * J[f, m + 1, RIG + c]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def eliminate(use, d, damping, L, first, S):
+    """Factor the landmarks' Hessians, diagonals times 1 + damping, in place, and turn their rows of S into L^-1 W.
+
+    A landmark whose Hessian is singular says nothing: its rows become zero, and its step will.
+    """
+    for i in range(len(use)):
+        if not use[i]:
+            continue
+        row = first[i]
+        if not _factor(L[i], d, damping):
+            L[i] = 0.0
+            S[row:row + d] = 0.0
+            continue
+        for j in range(d):
+            to = S[row + j]
+            for k in range(j):
+                x, of = L[i, j, k], S[row + k]
+                for c in range(len(to)):
+                    to[c] -= x * of[c]
+            x = 1.0 / L[i, j, j]
+            for c in range(len(to)):
+                to[c] *= x
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _factor(A, d, damping):
+    """Lower triangle of A (d, d), its diagonal times 1 + damping -> L in place; False when not positive definite."""
+    for j in range(d):
+        t = A[j, j] * (1.0 + damping)
+        for k in range(j):
+            t -= A[j, k] * A[j, k]
+        if not t > 0.0:
+            return False
+        A[j, j] = np.sqrt(t)
+        for i in range(j + 1, d):
+            t = A[i, j]
+            for k in range(j):
+                t -= A[i, k] * A[j, k]
+            A[i, j] = t / A[j, j]
+    return True
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def gradients(n, use, d, pull, at, undo, by_land, L, a, first, J, own, s):
+    """Add what the residuals pull at each slot's [rig, pose] to own (slots, LANES); fill the landmarks' rows of s (K,)
+    with L^-1 a."""
+    for i in range(len(use)):
+        if not use[i]:
+            continue
+        for f in range(n):
+            m = at[i, f]
+            if m < 0:
+                continue
+            x, y = undo[i, f] * pull[i, f, 0], undo[i, f] * pull[i, f, 1]
+            for c in range(LANES):
+                own[f, c] += x * J[f, m, c] + y * J[f, m + 1, c]
+            for j in range(d):
+                a[i, j] += x * by_land[i, f, 0, j] + y * by_land[i, f, 1, j]
+        row = first[i]
+        for j in range(d):
+            t = a[i, j]
+            for k in range(j):
+                t -= L[i, j, k] * s[row + k]
+            s[row + j] = t / L[i, j, j] if L[i, j, j] > 0.0 else 0.0
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def add_gradient(n, own, g):
+    """Add the slots' pulls own (slots, LANES) to the gradient g of the window."""
+    for f in range(n):
+        for c in range(RIG):
+            g[c] += own[f, c]
+        for c in range(POSE):
+            g[state_row(f) + c] += own[f, RIG + c]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def spread(n, q, g):
+    """Add q (C,), over the columns that cameras see, to the gradient g of the window."""
+    for c in range(RIG):
+        g[c] += q[c]
+    for f in range(n):
+        for c in range(POSE):
+            g[state_row(f) + c] += q[column(f) + c]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def gather(n, dx, columns):
+    """Fill columns (C,) with the parts of a step dx of the window that cameras see."""
+    for c in range(RIG):
+        columns[c] = dx[c]
+    for f in range(n):
+        for c in range(POSE):
+            columns[column(f) + c] = dx[state_row(f) + c]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def add_hessian(n, own, SS, H):
+    """Add the slots' own Hessians own (slots, LANES, LANES) and -SS (C, C), over the columns that cameras see, to H."""
+    rows = np.empty(len(SS), np.int64)
+    rows[:RIG] = np.arange(RIG)
+    for f in range(n):
+        for a in range(POSE):
+            rows[column(f) + a] = state_row(f) + a
+        for a in range(RIG):
+            for c in range(RIG):
+                H[a, c] += own[f, a, c]
+            for c in range(POSE):
+                H[a, state_row(f) + c] += own[f, a, RIG + c]
+                H[state_row(f) + c, a] += own[f, a, RIG + c]
+        for a in range(POSE):
+            for c in range(POSE):
+                H[state_row(f) + a, state_row(f) + c] += own[f, RIG + a, RIG + c]
+    for a in range(column(n)):
+        for c in range(column(n)):
+            H[rows[a], rows[c]] -= SS[a, c]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def back_substitute(use, d, L, first, t, step):
+    """Landmark steps (M, d) = -L'^-1 t, t (K,) = s + S dx."""
+    for i in range(len(use)):
+        for j in range(d - 1, -1, -1):
+            step[i, j] = 0.0
+            if not (use[i] and L[i, j, j] > 0.0):
+                continue
+            x = -t[first[i] + j]
+            for k in range(j + 1, d):
+                x -= L[i, k, j] * step[i, k]
+            step[i, j] = x / L[i, j, j]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

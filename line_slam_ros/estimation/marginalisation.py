@@ -4,7 +4,7 @@ from __future__ import annotations
 import numpy as np
 
 from line_slam_ros.estimation.solver import Solver
-from line_slam_ros.estimation.window import STATE
+from line_slam_ros.estimation.window import RIG, STATE, state_row
 from line_slam_ros.types import F64
 
 NO_LINKS = (0, 0)
@@ -26,7 +26,7 @@ def marginalise_oldest(solver: Solver, points: np.ndarray, lines: np.ndarray) ->
 def drop_state(solver: Solver, slot: int) -> None:
     """Remove a state that is no keyframe: its views go, its links become one, the prior is marginalised."""
     window = solver.window
-    own = slice(STATE * slot, STATE * (slot + 1))
+    own = slice(state_row(slot), state_row(slot + 1))
     if np.any(window.prior_H[own, own]):
         none = np.zeros(0, np.bool_)
         _into_prior(solver, slot, none, none, NO_LINKS)
@@ -41,11 +41,11 @@ def _into_prior(solver: Solver, slot: int, points: np.ndarray, lines: np.ndarray
     """
     window = solver.window
     solver.linearise(points, lines, links=links)
-    gone = np.arange(STATE * slot, STATE * (slot + 1))
-    kept = np.setdiff1d(window.rows(), gone)
+    gone = np.arange(state_row(slot), state_row(slot + 1))
+    kept = np.setdiff1d(np.arange(window.rows), gone)
     reduced_H, reduced_g = eliminate(solver.H, solver.g, gone, kept)
-    touched = np.unique(kept[np.any(reduced_H != 0.0, axis=1)] // STATE)
-    window.freeze(touched[touched < window.n])
+    touched = kept[np.any(reduced_H != 0.0, axis=1)]
+    window.freeze(np.unique((touched[touched >= RIG] - RIG) // STATE))
     delta = window.delta(np.empty(len(window.prior_g)))
     window.prior_H[:], window.prior_g[:] = 0.0, 0.0
     window.prior_H[np.ix_(kept, kept)] = reduced_H

@@ -8,70 +8,88 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg.lapack import dpotrf, dpotrs
 
 from line_slam_ros.estimation.landmarks import (
-    add_lines,
-    add_points,
+    LANES,
+    add_gradient,
+    add_hessian,
     back_substitute,
-    line_cost,
-    mirror,
-    point_cost,
+    column,
+    eliminate,
+    gather,
+    gradients,
+    line_jacobians,
+    line_residuals,
+    point_jacobians,
+    point_residuals,
     retract_landmarks,
+    spread,
 )
-from line_slam_ros.estimation.window import RIG, STATE, Window
+from line_slam_ros.estimation.window import POSE, RIG, STATE, Window, state_row
 from line_slam_ros.factors.imu_factor import imu_jacobians, imu_residual
 from line_slam_ros.geometry.lie_kernels import retract_rotation
 from line_slam_ros.types import F64, LineForm
 
+TRACE = 1e-9  # information that holds what nothing says anything about
+TRUSTED = 0.5  # of the predicted change of the cost: a smaller error, and the Jacobians serve for another step
 CONVERGED = 1.0  # change of the cost (half squared standard deviations) below which iterating ends
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def add_links(first, last, R, p, v, b, R0, p0, v0, b0, dt, dR, dp, dv, J_b, b_lin, W, w_b, g_W, H, g):
-    """Inertial factors of links first .. last - 1 into (H, g); residuals at present, Jacobians at first estimates."""
-    r, J_i, J_j = np.empty(15), np.empty((15, 15)), np.empty((15, 15))
+def link_residuals(first, last, R, p, v, b, dt, dR, dp, dv, J_b, b_lin, W, w_b, g_W, r):
+    """Whitened residuals r (slots, 15) of the inertial links first .. last - 1; returns half their squares."""
+    cost = 0.0
     for k in range(first, last):
         m = k + 1
         imu_residual(R[k], p[k], v[k], b[k], R[m], p[m], v[m], b[m], dt[k], dR[k], dp[k], dv[k], J_b[k], b_lin[k],
-                     W[k], w_b[k], g_W, r)
-        imu_jacobians(R0[k], p0[k], v0[k], b0[k], R0[m], p0[m], v0[m], b0[m], dt[k], dR[k], dp[k], dv[k], J_b[k],
-                      b_lin[k], W[k], w_b[k], g_W, J_i, J_j)
-        o, q = STATE * k, STATE * m
-        for i in range(15):
-            for j in range(15):
-                ii, ij, jj = 0.0, 0.0, 0.0
-                for x in range(15):
-                    ii += J_i[x, i] * J_i[x, j]
-                    ij += J_i[x, i] * J_j[x, j]
-                    jj += J_j[x, i] * J_j[x, j]
-                H[o + i, o + j] += ii
-                H[o + i, q + j] += ij
-                H[q + j, o + i] += ij
-                H[q + i, q + j] += jj
-            for x in range(15):
-                g[o + i] += J_i[x, i] * r[x]
-                g[q + i] += J_j[x, i] * r[x]
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def link_cost(n, R, p, v, b, dt, dR, dp, dv, J_b, b_lin, W, w_b, g_W):
-    """Half the squared whitened inertial residuals of all links."""
-    r, cost = np.empty(15), 0.0
-    for k in range(n - 1):
-        m = k + 1
-        imu_residual(R[k], p[k], v[k], b[k], R[m], p[m], v[m], b[m], dt[k], dR[k], dp[k], dv[k], J_b[k], b_lin[k],
-                     W[k], w_b[k], g_W, r)
-        for i in range(15):
-            cost += r[i] * r[i]
+                     W[k], w_b[k], g_W, r[k])
+        for i in range(STATE):
+            cost += r[k, i] * r[k, i]
     return 0.5 * cost
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
+def add_link_hessians(first, last, R, p, v, b, dt, dR, dp, dv, J_b, b_lin, W, w_b, g_W, J, H):
+    """Jacobians J (slots, 2, 15, 15), by both states, of the links first .. last - 1, and their squares into H."""
+    products = np.empty((STATE, 3, STATE))  # of both states: J_i' J_i, J_i' J_j, J_j' J_j by rows
+    for k in range(first, last):
+        m = k + 1
+        J_i, J_j = J[k, 0], J[k, 1]
+        imu_jacobians(R[k], p[k], v[k], b[k], R[m], p[m], v[m], b[m], dt[k], dR[k], dp[k], dv[k], J_b[k], b_lin[k],
+                      W[k], w_b[k], g_W, J_i, J_j)
+        o, q = state_row(k), state_row(m)
+        for i in range(STATE):
+            products[i] = 0.0
+            for x in range(STATE):
+                y, z = J_i[x, i], J_j[x, i]
+                for j in range(STATE):
+                    products[i, 0, j] += y * J_i[x, j]
+                    products[i, 1, j] += y * J_j[x, j]
+                    products[i, 2, j] += z * J_j[x, j]
+            for j in range(STATE):
+                H[o + i, o + j] += products[i, 0, j]
+                H[o + i, q + j] += products[i, 1, j]
+                H[q + j, o + i] += products[i, 1, j]
+                H[q + i, q + j] += products[i, 2, j]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def add_link_gradients(first, last, J, r, g):
+    """What the residuals r (slots, 15) of the links first .. last - 1 pull at their states, into g."""
+    for k in range(first, last):
+        for side in range(2):
+            o = state_row(k + side)
+            for x in range(STATE):
+                for i in range(STATE):
+                    g[o + i] += J[k, side, x, i] * r[k, x]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
 def retract_states(n, R, p, v, b, dx):
-    """Apply a step dx (15 n,) in place."""
+    """Apply the states' rows of a step dx in place."""
     for k in range(n):
-        o = STATE * k
+        o = state_row(k)
         retract_rotation(R[k], dx[o:o + 3], R[k])
         for i in range(3):
             p[k, i] += dx[o + 3 + i]
@@ -115,52 +133,111 @@ class SolverOptions:
     still_shift: float = 1e-3  # m, and how far it may move between two states at rest
 
 
+class _Landmarks:
+    """Buffers for the landmarks of one kind; see landmarks.py."""
+
+    def __init__(self, rows: int, slots: int, size: int):
+        self.size = size
+        self.use = np.zeros(0, np.bool_)  # of the rows in use, those that take part
+        self.chi2, self.pull, self.weight = np.zeros((rows, slots)), np.zeros((rows, slots, 2)), np.zeros((rows, slots))
+        self.at, self.undo = np.full((rows, slots), -1), np.zeros((rows, slots))
+        self.by_land = np.zeros((rows, slots, 2, size))
+        self.L, self.a, self.step = np.zeros((rows, size, size)), np.zeros((rows, size)), np.zeros((rows, size))
+        self.first = np.zeros(rows, np.int64)
+
+    def choose(self, use: np.ndarray, row: int) -> int:
+        """Let the landmarks of the rows in use (M,) take part, theirs from row on; returns the row behind the last."""
+        self.use = use
+        self.first[:len(use)] = row + self.size * (np.cumsum(use) - use)
+        return row + self.size * int(use.sum())
+
+
 class Solver:
-    """Optimises a Window in place; owns every buffer it needs."""
+    """Optimises a Window in place; owns every buffer it needs.
+
+    Jacobians are taken, and the equations factored, once (linearise); residuals and gradient follow every step. Only
+    where the cost does not fall as the equations predict they are taken anew.
+    """
 
     def __init__(self, window: Window, options: SolverOptions):
         self.window, self.options = window, options
-        size, rows_p, rows_l, slots = len(window.prior_g), len(window.points.ids), len(window.lines.ids), window.slots
+        size, slots = len(window.prior_g), window.slots
+        rows_p, rows_l = len(window.points.ids), len(window.lines.ids)
         self.H, self.g, self._delta, self._dx = np.zeros((size, size)), np.zeros(size), np.zeros(size), np.zeros(size)
         self._R, self._p, self._twist = np.zeros((slots, 3, 3)), np.zeros((slots, 3)), np.zeros((slots, 6))
         self._R0, self._p0 = np.zeros((slots, 3, 3)), np.zeros((slots, 3))
-        self._E_p, self._E_l = np.zeros((rows_p, slots, 3, 6)), np.zeros((rows_l, slots, 4, 6))
-        self._B_p, self._B_l = np.zeros((rows_p, 3, RIG)), np.zeros((rows_l, 4, RIG))
-        self._A_p, self._A_l = np.zeros((rows_p, 3, 3)), np.zeros((rows_l, 4, 4))
-        self._a_p, self._a_l = np.zeros((rows_p, 3)), np.zeros((rows_l, 4))
-        self._step_p, self._step_l = np.zeros((rows_p, 3)), np.zeros((rows_l, 4))
-        self.chi2_points, self.chi2_lines = np.zeros((rows_p, slots)), np.zeros((rows_l, slots))
-        self._damping, self.linearised_with = 1e-6, 0.0  # linearised_with: damping that H and the landmarks' A hold
+        self._links, self._link_r, self._link_J = (0, 0), np.zeros((slots, STATE)), np.zeros((slots, 2, STATE, STATE))
+        self.points, self.lines = _Landmarks(rows_p, slots, 3), _Landmarks(rows_l, slots, 4)
+        self._J, self._count = np.zeros((slots, 2 * (rows_p + rows_l), LANES)), np.zeros(slots, np.int64)
+        self._S, self._s = np.zeros((3 * rows_p + 4 * rows_l, column(slots))), np.zeros(3 * rows_p + 4 * rows_l)
+        self._rows = 0  # of S, s in use
+        self._columns = np.zeros(column(slots))
+        self._factor: F64 | None = None  # upper triangular, of H; empty: it has none; None: not computed yet
+        self._damping, self.linearised_with = 1e-6, 0.0  # linearised_with: damping that H and the landmarks' L hold
 
     def linearise(self, use_points, use_lines, damping: float = 0.0, links: tuple[int, int] | None = None) -> None:
-        """Fill H (15 n, 15 n) and g from the chosen landmarks, the prior, links [first, last) and their rests.
+        """Fill H and g from the chosen landmarks, the prior, links [first, last) and their rests.
 
         The last state of a range of links is left to the range that starts with it.
         """
-        w, o, n = self.window, self.options, self.window.n
-        w.unfrozen_to_current()
-        self.H[:] = w.prior_H
-        self.g[:] = w.prior_g + w.prior_H @ w.delta(self._delta)
-        first, last = links or (0, n - 1)
-        add_links(first, last, w.R, w.p, w.v, w.b, w.R0, w.p0, w.v0, w.b0, w.dt, w.dR, w.dp, w.dv, w.J_b, w.b_lin,
-                  w.W, w.w_b, o.g_W, self.H, self.g)
-        self._add_rest(first, last, n if links is None else last)
-        self.linearised_with = damping
-        self._expose()
-        exposures(n, w.R0, w.p0, w.v, w.rates, w.delay[0], self._R0, self._p0, self._twist)
-        t, rig = w.points, self._rig()
-        add_points(n, self._R, self._p, self._R0, self._p0, w.R_BC, w.p_BC, self._twist, rig, use_points, t.seen, t.z,
-                   t.sigma, t.abr, t.R_WA, t.p_WA, o.point_c2, o.rho0, o.w_rho, damping, self.H, self.g, self._E_p,
-                   self._B_p, self._A_p, self._a_p)
-        t = w.lines
-        add_lines(n, self._R, self._p, self._R0, self._p0, w.R_BC, w.p_BC, self._twist, rig, use_lines, t.seen, t.z,
-                  t.sigma, int(o.line_form), t.values, t.origin, o.line_c2, damping, self.H, self.g, self._E_l,
-                  self._B_l, self._A_l, self._a_l)
-        mirror(n, rig, self.H)
+        self._links = links or (0, self.window.n - 1)
+        self._choose(use_points, use_lines)
+        self._evaluate()
+        self._take_jacobians(damping)
+        self._take_gradient()
 
-    def _rig(self) -> int:
-        """First row of the rig, -1 when it is not estimated."""
-        return STATE * self.window.slots if self.window.rig_sigma.any() else -1
+    def _choose(self, use_points, use_lines) -> None:
+        self._rows = self.lines.choose(use_lines, self.points.choose(use_points, 0))
+
+    def _evaluate(self) -> float:
+        """Residuals at the present estimate; returns the robust cost."""
+        w, o = self.window, self.options
+        p, q, kp, kl = w.points, w.lines, self.points, self.lines
+        self._expose()
+        d = w.delta(self._delta)
+        return (float(d @ (0.5 * (w.prior_H @ d) + w.prior_g)) + self._rest_cost() + self.inertial_cost()
+                + point_residuals(w.n, self._R, self._p, w.R_BC, w.p_BC, kp.use, p.seen, p.z, p.sigma, p.abr, p.R_WA,
+                                  p.p_WA, o.point_c2, o.rho0, o.w_rho, kp.chi2, kp.pull, kp.weight, kp.a)
+                + line_residuals(w.n, self._R, self._p, w.R_BC, w.p_BC, kl.use, q.seen, q.z, q.sigma, int(o.line_form),
+                                 q.values, q.origin, o.line_c2, kl.chi2, kl.pull, kl.weight, kl.a))
+
+    def _take_jacobians(self, damping: float) -> None:
+        """Jacobians at the first estimates, with the weights of the last evaluation: H, and all that steps need."""
+        w, o, n = self.window, self.options, self.window.n
+        p, q, kp, kl = w.points, w.lines, self.points, self.lines
+        w.unfrozen_to_current()
+        self.linearised_with, self._factor = damping, None
+        self.H[:] = w.prior_H
+        add_link_hessians(*self._links, w.R0, w.p0, w.v0, w.b0, w.dt, w.dR, w.dp, w.dv, w.J_b, w.b_lin, w.W, w.w_b,
+                          o.g_W, self._link_J, self.H)
+        self._add_rest()
+        exposures(n, w.R0, w.p0, w.v, w.rates, w.delay[0], self._R0, self._p0, self._twist)
+        S = self._S[:self._rows, :column(n)]
+        S[:], self._count[:] = 0.0, 0
+        point_jacobians(n, self._R0, self._p0, w.R_BC, w.p_BC, self._twist, kp.use, p.z, p.sigma, p.abr, p.R_WA, p.p_WA,
+                        o.w_rho, kp.weight, self._count, self._J, kp.at, kp.undo, kp.by_land, kp.L, kp.first, S)
+        line_jacobians(n, self._R0, self._p0, w.R_BC, w.p_BC, self._twist, kl.use, q.z, q.sigma, int(o.line_form),
+                       q.values, q.origin, kl.weight, self._count, self._J, kl.at, kl.undo, kl.by_land, kl.L, kl.first,
+                       S)
+        for kind in (kp, kl):
+            eliminate(kind.use, kind.size, damping, kind.L, kind.first, S)
+        own = np.stack([J[:k].T @ J[:k] for J, k in zip(self._J[:n], self._count, strict=False)])
+        add_hessian(n, own, S.T @ S, self.H)
+        _hold(self.H, np.flatnonzero(w.rig_sigma == 0.0))
+
+    def _take_gradient(self) -> None:
+        """g of the last evaluation, by the Jacobians taken last."""
+        w, n = self.window, self.window.n
+        self.g[:] = w.prior_g + w.prior_H @ w.delta(self._delta)
+        add_link_gradients(*self._links, self._link_J, self._link_r, self.g)
+        self._add_rest_gradient()
+        own = np.zeros((n, LANES))
+        for kind in (self.points, self.lines):
+            gradients(n, kind.use, kind.size, kind.pull, kind.at, kind.undo, kind.by_land, kind.L, kind.a, kind.first,
+                      self._J, own, self._s)
+        add_gradient(n, own, self.g)
+        spread(n, -(self._s[:self._rows] @ self._S[:self._rows, :column(n)]), self.g)
+        self.g[:RIG][w.rig_sigma == 0.0] = 0.0
 
     def _expose(self) -> None:
         """Body poses at the times when the images were really taken."""
@@ -172,86 +249,104 @@ class Solver:
         self._expose()
         return self._R[:self.window.n], self._p[:self.window.n]
 
-    def _add_rest(self, first: int, last: int, end: int) -> None:
-        """States [first, end) at rest have no velocity; links [first, last) between two of them have no length."""
-        w, o, one = self.window, self.options, np.eye(3)
-        for k in first + np.flatnonzero(w.still[first:end]):
-            v = slice(STATE * k + 6, STATE * k + 9)
-            self.H[v, v] += one / o.still_speed**2
-            self.g[v] += w.v[k] / o.still_speed**2
-        for k in first + np.flatnonzero(w.still[first:last] & w.still[first + 1:last + 1]):
-            a, b = slice(STATE * k + 3, STATE * k + 6), slice(STATE * k + 18, STATE * k + 21)
-            shift = (w.p[k + 1] - w.p[k]) / o.still_shift**2
-            self.H[a, a] += one / o.still_shift**2
-            self.H[b, b] += one / o.still_shift**2
-            self.H[a, b] -= one / o.still_shift**2
-            self.H[b, a] -= one / o.still_shift**2
-            self.g[a] -= shift
-            self.g[b] += shift
+    def _resting(self) -> tuple[np.ndarray, np.ndarray]:
+        """Which states are at rest and have no velocity; which links between two of them have no length."""
+        still, n, (first, last) = self.window.still, self.window.n, self._links
+        return (first + np.flatnonzero(still[first:n if last == n - 1 else last]),
+                first + np.flatnonzero(still[first:last] & still[first + 1:last + 1]))
+
+    def _add_rest(self) -> None:
+        states, links = self._resting()
+        speed, shift = np.eye(3) / self.options.still_speed**2, np.eye(3) / self.options.still_shift**2
+        for k in states:
+            v = _part(k, 6)
+            self.H[v, v] += speed
+        for k in links:
+            a, b = _part(k, 3), _part(k + 1, 3)
+            self.H[a, a] += shift
+            self.H[b, b] += shift
+            self.H[a, b] -= shift
+            self.H[b, a] -= shift
+
+    def _add_rest_gradient(self) -> None:
+        w, (states, links) = self.window, self._resting()
+        for k in states:
+            self.g[_part(k, 6)] += w.v[k] / self.options.still_speed**2
+        for k in links:
+            shift = (w.p[k + 1] - w.p[k]) / self.options.still_shift**2
+            self.g[_part(k, 3)] -= shift
+            self.g[_part(k + 1, 3)] += shift
 
     def _rest_cost(self) -> float:
         w, o, n = self.window, self.options, self.window.n
+        if not w.still[:n].any():
+            return 0.0
         both = w.still[:n - 1] & w.still[1:n]
         return 0.5 * float(np.sum((w.v[:n][w.still[:n]] / o.still_speed) ** 2)
                            + np.sum((np.diff(w.p[:n], axis=0)[both] / o.still_shift) ** 2))
 
     def cost(self) -> float:
-        """Present robust cost; refreshes chi2_points and chi2_lines (rows, slots)."""
-        w, o, n = self.window, self.options, self.window.n
-        p, q = w.points, w.lines
-        d = w.delta(self._delta)
-        prior = d @ (0.5 * (w.prior_H @ d) + w.prior_g)
-        self._expose()
-        return (prior + self._rest_cost() + self.inertial_cost()
-                + point_cost(n, self._R, self._p, w.R_BC, w.p_BC, p.solved[:p.count], p.seen, p.z, p.sigma, p.abr,
-                             p.R_WA, p.p_WA, o.point_c2, o.rho0, o.w_rho, self.chi2_points)
-                + line_cost(n, self._R, self._p, w.R_BC, w.p_BC, q.solved[:q.count], q.seen, q.z, q.sigma,
-                            int(o.line_form), q.values, q.origin, o.line_c2, self.chi2_lines))
+        """Present robust cost; refreshes points.chi2 and lines.chi2 (rows, slots)."""
+        w = self.window
+        self._choose(w.points.solved[:w.points.count], w.lines.solved[:w.lines.count])
+        return self._evaluate()
 
     def inertial_cost(self) -> float:
         """Half the squared whitened residuals of all inertial links."""
         w = self.window
-        return link_cost(w.n, w.R, w.p, w.v, w.b, w.dt, w.dR, w.dp, w.dv, w.J_b, w.b_lin, w.W, w.w_b, self.options.g_W)
+        return link_residuals(0, w.n - 1, w.R, w.p, w.v, w.b, w.dt, w.dR, w.dp, w.dv, w.J_b, w.b_lin, w.W, w.w_b,
+                              self.options.g_W, self._link_r)
 
     def optimise(self, iterations: int) -> float:
         """Up to that many steps; returns the final cost."""
-        w = self.window
-        use_p, use_l = w.points.solved[:w.points.count], w.lines.solved[:w.lines.count]
-        cost = self.cost()
+        self._links = 0, self.window.n - 1
+        cost, trusted = self.cost(), False
         for _ in range(iterations):
-            self.linearise(use_p, use_l, self._damping)
+            if not trusted:
+                self._take_jacobians(self._damping)
+            self._take_gradient()
             before = self._save()
-            if not self._step(use_p, use_l):
-                self._damping = min(max(10.0 * self._damping, 1e-4), 1e4)
-                continue
-            new_cost = self.cost()
+            predicted = self._step()
+            new_cost = self._evaluate() if predicted > 0.0 else np.inf
             gain = cost - new_cost
             if gain > 0.0:
-                self._damping, cost = max(0.1 * self._damping, 1e-9), new_cost
+                trusted, cost = abs(gain - predicted) < TRUSTED * predicted, new_cost
+                self._damping = max(0.1 * self._damping, 1e-9)
             else:
+                trusted = False
                 self._restore(before)
+                self._evaluate()
                 self._damping = min(max(10.0 * self._damping, 1e-4), 1e4)
             if abs(gain) < CONVERGED:
                 break
-        return self.cost()
+        return cost
 
-    def _step(self, use_p, use_l) -> bool:
-        w, rows, dx = self.window, self.window.rows(), self._dx
-        H = self.H[np.ix_(rows, rows)]
-        H[np.arange(len(rows)), np.arange(len(rows))] *= 1.0 + self._damping
-        dx[:] = 0.0
-        try:
-            dx[rows] = -cho_solve(cho_factor(H, lower=True, check_finite=False), self.g[rows], check_finite=False)
-        except LinAlgError:
-            return False
-        rig, p, q = self._rig(), w.points, w.lines
-        back_substitute(w.n, use_p, p.seen, 3, rig, self._E_p, self._B_p, self._A_p, self._a_p, dx, self._step_p)
-        back_substitute(w.n, use_l, q.seen, 4, rig, self._E_l, self._B_l, self._A_l, self._a_l, dx, self._step_l)
-        retract_states(w.n, w.R, w.p, w.v, w.b, dx)
-        retract_rig(w.R_BC, w.p_BC, w.delay, dx[STATE * w.slots:])
-        retract_landmarks(use_p, w.points.abr, self._step_p, use_l, int(self.options.line_form),
-                          w.lines.values, self._step_l)
-        return True
+    def _factored(self) -> F64:
+        """Of the equations; empty when they have no solution."""
+        if self._factor is None:
+            rows = self.window.rows
+            self._factor = _cholesky(self.H[:rows, :rows], self.linearised_with)
+        return self._factor
+
+    def _step(self) -> float:
+        """Solve the equations and move everything; returns by how much the cost should fall, 0 without a solution."""
+        w, dx, rows, n = self.window, self._dx, self.window.rows, self.window.n
+        factor = self._factored()
+        if not len(factor):
+            return 0.0
+        s, S = self._s[:self._rows], self._S[:self._rows, :column(n)]
+        dx[:rows] = _solve(factor, -self.g[:rows])
+        predicted = 0.5 * float(s @ s - self.g[:rows] @ dx[:rows])
+        columns = self._columns[:column(n)]
+        gather(n, dx, columns)
+        t = s + S @ columns
+        for kind in (self.points, self.lines):
+            back_substitute(kind.use, kind.size, kind.L, kind.first, t, kind.step)
+        retract_states(n, w.R, w.p, w.v, w.b, dx)
+        retract_rig(w.R_BC, w.p_BC, w.delay, dx[:RIG])
+        retract_landmarks(self.points.use, w.points.abr, self.points.step, self.lines.use, int(self.options.line_form),
+                          w.lines.values, self.lines.step)
+        return predicted
 
     def _save(self) -> list[np.ndarray]:
         w = self.window
@@ -267,33 +362,48 @@ class Solver:
         return [(w.R, n), (w.p, n), (w.v, n), (w.b, n), (w.R_BC, 3), (w.p_BC, 3), (w.delay, 1), (w.points.abr, p),
                 (w.lines.values, q)]
 
-    def _information(self, rows: np.ndarray) -> tuple[F64, bool]:
-        """Cholesky factor of those rows of H, for cho_solve; what nothing says anything about is held by a trace."""
-        return cho_factor(self.H[np.ix_(rows, rows)] + 1e-9 * np.eye(len(rows)), lower=True, check_finite=False)
-
-    def covariance(self, slot: int) -> F64:
-        """(15, 15) of one state given everything in the window; needs a fresh linearise."""
-        rows, o = self.window.rows(), STATE * slot
-        rhs = np.zeros((len(rows), STATE))
-        rhs[o:o + STATE] = np.eye(STATE)
-        return cho_solve(self._information(rows), rhs, check_finite=False)[o:o + STATE]
+    def covariance(self) -> F64:
+        """(15, 15) of the newest state given everything in the window, by the equations linearised last."""
+        newest = np.linalg.inv(self._factored()[-STATE:, -STATE:])
+        return newest @ newest.T
 
     def line_covariances(self, lines: np.ndarray) -> F64:
         """(L, 4, 4) of the lines in those rows, in their tangent, as the newest camera knows them; after a linearise.
 
-        A^-1 + (A^-1 W) S (A^-1 W)' with W = [E B] the ties to poses and rig and S the covariance of these, given the
-        newest pose: where that pose is in the world is not the line's doubt, how the others stood to it is.
+        A^-1 + (A^-1 W) C (A^-1 W)' with W the ties to rig and poses and C the covariance of these, given the newest
+        pose: where that pose is in the world is not the line's doubt, how the others stood to it is.
         """
-        w, A = self.window, self._A_l[lines]
-        newest = STATE * (w.n - 1)
-        rows = np.setdiff1d(w.rows(), np.arange(newest, newest + 6))
-        tied = rows[(rows >= STATE * w.slots) | ((rows % STATE < 6) & (rows < newest))]
-        W = np.zeros((len(lines), 4, len(self.g)))
-        for slot in range(w.n):
-            W[:, :, STATE * slot:STATE * slot + 6] = self._E_l[lines, slot] * w.lines.seen[lines, slot, None, None]
-        W[:, :, STATE * w.slots:] = self._B_l[lines]
-        ties = np.zeros((len(rows), len(tied)))
-        ties[np.searchsorted(rows, tied), np.arange(len(tied))] = 1.0
-        S = cho_solve(self._information(rows), ties, check_finite=False)[np.searchsorted(rows, tied)]
-        AW = A @ W[:, :, tied]
-        return A + AW @ S @ AW.transpose(0, 2, 1)
+        n, rows = self.window.n, self.window.rows
+        H = self.H[:rows, :rows].copy()
+        _hold(H, np.arange(state_row(n - 1), state_row(n - 1) + POSE))
+        seen = np.concatenate([np.arange(RIG), *(np.arange(state_row(k), state_row(k) + POSE) for k in range(n - 1))])
+        ties = np.zeros((rows, len(seen)))
+        ties[seen, np.arange(len(seen))] = 1.0
+        C = _solve(_cholesky(H), ties)[seen]
+        S = self._S[self.lines.first[lines, None] + np.arange(4), :len(seen)]
+        inverse = np.linalg.inv(self.lines.L[lines]).transpose(0, 2, 1)
+        AW = inverse @ S
+        return inverse @ inverse.transpose(0, 2, 1) + AW @ C @ AW.transpose(0, 2, 1)
+
+
+def _part(slot: int, first: int) -> slice:
+    """Three rows of a slot's state."""
+    return slice(state_row(slot) + first, state_row(slot) + first + 3)
+
+
+def _hold(H: F64, rows: np.ndarray) -> None:
+    """Make the unknowns of those rows constants, in place."""
+    H[rows], H[:, rows], H[rows, rows] = 0.0, 0.0, 1.0
+
+
+def _cholesky(H: F64, damping: float = 0.0) -> F64:
+    """Upper U (D, D) with U' U = H, its diagonal times 1 + damping; (0, 0) when H is not positive definite."""
+    factor = H.copy()
+    np.fill_diagonal(factor, (1.0 + damping) * np.diag(H) + TRACE)
+    lower, info = dpotrf(factor.T, lower=1, clean=1, overwrite_a=1)
+    return lower.T if info == 0 else np.zeros((0, 0))
+
+
+def _solve(factor: F64, b: F64) -> F64:
+    """x (D, ...) with U' U x = b."""
+    return dpotrs(factor.T, b, lower=1)[0]

@@ -2,7 +2,7 @@
 
 Structure of arrays, allocated once; slot 0 is the oldest state, slot n - 1 the newest. The rig is how camera and IMU
 belong together: the camera's pose in the body, and by how much an image was taken later than its stamp says. Its rows
-in the equations come after those of the last slot, used or not.
+in the equations come first, then those of the slots (state_row).
 """
 from __future__ import annotations
 
@@ -17,15 +17,22 @@ from line_slam_ros.types import F64, I64, ImuNoise, Samples
 REST_S = 2.0  # longer at rest, the accelerometer only ties tilt and bias ever tighter: too stiff to solve, nothing new
 REST_SAMPLES = 1000  # inertial samples of a link between states at rest beyond which they are averaged
 STATE = 15  # [rotation, position, velocity, gyro bias, accelerometer bias]
+POSE = 6  # the part of a state that a camera sees
 RIG = 7  # [rotation and position of the camera in the body, time offset]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
+def state_row(slot):
+    """First row of a slot's state in the equations."""
+    return RIG + STATE * slot
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
 def state_difference(n, R, p, v, b, R0, p0, v0, b0, delta):
-    """delta (15 n,) = present state minus first estimate, rotation as Log(R0' R)."""
+    """Fill the rows of the states of delta with present state minus first estimate, rotation as Log(R0' R)."""
     E = np.empty((3, 3))
     for k in range(n):
-        o = STATE * k
+        o = state_row(k)
         multiply_transposed(R0[k], R[k], E)
         log_so3(E, delta[o:o + 3])
         for i in range(3):
@@ -101,11 +108,14 @@ class LandmarkTable:
 
     def keep(self, mask: np.ndarray) -> None:
         """Drop the rows where mask (count,) is False."""
-        kept = np.flatnonzero(mask)
+        if mask.all():
+            return
+        stays = int(np.argmin(mask))  # rows before the first that goes
+        moved = stays + np.flatnonzero(mask[stays:])
+        self.count = stays + len(moved)
         for name in self._columns:
             a = getattr(self, name)
-            a[:len(kept)] = a[kept]
-        self.count = len(kept)
+            a[stays:self.count] = a[moved]
 
 
 class Window:
@@ -129,7 +139,7 @@ class Window:
         self.calibrated = np.eye(3), np.zeros(3)  # R_BC, p_BC as given
         self.R_BC, self.p_BC, self.delay = np.eye(3), np.zeros(3), np.zeros(1)  # delay: s, of the image after its stamp
         self.rig_sigma = np.zeros(RIG)  # of what was given; what is zero is not estimated
-        size = STATE * slots + RIG
+        size = RIG + STATE * slots
         self.prior_H, self.prior_g = np.zeros((size, size)), np.zeros(size)
         self.points = LandmarkTable(max_points, slots, (2,), {'abr': (3,), 'R_WA': (3, 3), 'p_WA': (3,)})
         self.lines = LandmarkTable(max_lines, slots, (2, 2), {'values': (VALUES,), 'origin': (3,)})
@@ -140,27 +150,24 @@ class Window:
         self.samples.clear()
         self.prior_H[:], self.prior_g[:] = 0.0, 0.0
         self.R_BC[:], self.p_BC[:], self.delay[:] = *self.calibrated, 0.0
-        free = self.rig_rows()
-        self.prior_H[free, free] = self.rig_sigma[free - STATE * self.slots]**-2.0
+        free = np.flatnonzero(self.rig_sigma)
+        self.prior_H[free, free] = self.rig_sigma[free]**-2.0
 
     def set_rig(self, R_BC: F64, p_BC: F64, sigma: F64) -> None:
         """The camera in the body as calibrated, and sigma (7,), how far that may be wrong (0: not at all)."""
         self.calibrated, self.rig_sigma = (R_BC.copy(), p_BC.copy()), sigma
         self.clear()
 
-    def rig_rows(self) -> I64:
-        """Rows of the rig that are estimated."""
-        return STATE * self.slots + np.flatnonzero(self.rig_sigma)
-
-    def rows(self) -> I64:
-        """All rows of the equations that are in use."""
-        return np.concatenate([np.arange(STATE * self.n), self.rig_rows()])
+    @property
+    def rows(self) -> int:
+        """Number of rows of the equations that are in use: the first ones."""
+        return state_row(self.n)
 
     def delta(self, out: F64) -> F64:
-        """out (15 slots + 7,) = present states and rig minus their first estimates, zero where not in use."""
-        out[STATE * self.n:] = 0.0
+        """out (7 + 15 slots,) = present rig and states minus their first estimates, zero where not in use."""
+        out[self.rows:] = 0.0
         state_difference(self.n, self.R, self.p, self.v, self.b, self.R0, self.p0, self.v0, self.b0, out)
-        rig_difference(self.R_BC, self.p_BC, self.delay, *self.calibrated, out[STATE * self.slots:])
+        rig_difference(self.R_BC, self.p_BC, self.delay, *self.calibrated, out[:RIG])
         return out
 
     def append(self, t_ns: int, R: F64, p: F64, v: F64, b: F64, samples: Samples | None) -> int:
@@ -199,10 +206,10 @@ class Window:
 
     def recentre_prior(self) -> None:
         """Move every first estimate to the present state and the prior along; rotations to first order."""
-        dim = STATE * self.n
-        delta = self.delta(np.empty(len(self.prior_g)))[:dim]
-        delta.reshape(-1, STATE)[~self.frozen[:self.n]] = 0.0
-        self.prior_g += self.prior_H[:, :dim] @ delta
+        delta = self.delta(np.empty(len(self.prior_g)))
+        delta[:RIG] = 0.0
+        delta[RIG:self.rows].reshape(-1, STATE)[~self.frozen[:self.n]] = 0.0
+        self.prior_g += self.prior_H @ delta
         for first, now in ((self.R0, self.R), (self.p0, self.p), (self.v0, self.v), (self.b0, self.b)):
             first[:self.n] = now[:self.n]
 
@@ -236,7 +243,7 @@ class Window:
             self.integrate(slot - 1)
 
     def _remove_from_prior(self, slot: int) -> None:
-        lo, hi, end = STATE * slot, STATE * (slot + 1), STATE * self.n
+        lo, hi, end = state_row(slot), state_row(slot + 1), self.rows
         H, g = self.prior_H, self.prior_g
         H[lo:end - STATE] = H[hi:end].copy()
         H[:, lo:end - STATE] = H[:, hi:end].copy()

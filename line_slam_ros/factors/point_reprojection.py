@@ -4,7 +4,7 @@ from numba import njit
 MIN_DEPTH = 1e-3  # m: nearer, or behind, a point has no image
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
 def _in_body_and_camera(R_WB, p_WB, R_BC, p_BC, p_W):
     """(p_B, p_C) as six numbers."""
     d0, d1, d2 = p_W[0] - p_WB[0], p_W[1] - p_WB[1], p_W[2] - p_WB[2]
@@ -18,7 +18,7 @@ def _in_body_and_camera(R_WB, p_WB, R_BC, p_BC, p_W):
     return b0, b1, b2, c0, c1, c2
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
 def point_residual(R_WB, p_WB, R_BC, p_BC, p_W, x, r):
     """point_reprojection without its Jacobians."""
     _, _, _, c0, c1, c2 = _in_body_and_camera(R_WB, p_WB, R_BC, p_BC, p_W)
@@ -28,7 +28,7 @@ def point_residual(R_WB, p_WB, R_BC, p_BC, p_W, x, r):
     return True
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
 def point_reprojection(R_WB, p_WB, R_BC, p_BC, p_W, x, r, J_pose, J_ext, J_point):
     """Where a point projects minus where it was seen, normalised coordinates.
 
