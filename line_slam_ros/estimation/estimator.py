@@ -8,7 +8,7 @@ import numpy as np
 from line_slam_ros.config import Estimator as Options
 from line_slam_ros.estimation.initialisation import Snapshot, Start
 from line_slam_ros.estimation.marginalisation import drop_state, marginalise_oldest
-from line_slam_ros.estimation.solver import Solver, SolverOptions
+from line_slam_ros.estimation.solver import LEAST_DAMPING, Solver, SolverOptions
 from line_slam_ros.estimation.triangulation import start_lines, start_points
 from line_slam_ros.estimation.window import RIG, Window, state_row
 from line_slam_ros.geometry.lie import rigid
@@ -16,7 +16,6 @@ from line_slam_ros.geometry.line_forms import unit_world_lines
 from line_slam_ros.types import F64, I64, Calibration, LineForm, Observations, RigCorrection, Samples
 
 MAX_GYRO_BIAS, MAX_ACCEL_BIAS, MAX_SPEED = 0.5, 2.5, 50.0  # rad/s, m/s^2, m/s: beyond, the estimate is nonsense
-UNDAMPED = 1e-7  # damping too small to matter
 MIN_FEATURES = 6  # fewer that an earlier state saw, too, and the camera is blind
 
 
@@ -110,7 +109,7 @@ class Estimator:
 
         By the equations of the last step, or by fresh ones when those were damped: damping is no knowledge.
         """
-        if self.solver.linearised_with > UNDAMPED:
+        if self.solver.linearised_with > LEAST_DAMPING:
             self.linearise()
         return self.solver.covariance()[:9, :9]
 

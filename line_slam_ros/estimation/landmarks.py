@@ -4,13 +4,13 @@ All that a camera sees are the rig and the poses, so landmarks fill a system of 
 of slot 0, pose of slot 1, ...]. For landmark i, of d numbers (3 for a point, 4 for a line), and slot f the buffers hold
 
     chi2, weight (M, slots), pull (M, slots, 2)   squared whitened residual (-1: none), its robust weight, their product
-    at, undo (M, slots)                           where in J its Jacobian is (-1: nowhere), 1 / sqrt(weight) at that time
+    at, undo (M, slots)                           where in J its Jacobian is (-1: nowhere), 1 / sqrt(weight) then
     by_land (M, slots, 2, d)                      Jacobian by the landmark
     L (M, d, d), a (M, d)                         A = L L', the landmark's own Hessian, and its gradient
 
-and J (slots, K, LANES) the Jacobians by rig and pose, slot by slot, two rows an observation, whitened and weighted. In S
-each landmark has d rows, from first[i] on: its ties W to the columns, then L^-1 W. So eliminating all of them is S' S,
-and their gradients and steps need S' s and S dx with s = L^-1 a.
+and J (slots, K, LANES) the Jacobians by rig and pose, slot by slot, two rows an observation, whitened and weighted. In
+S each landmark has d rows, from first[i] on: its ties W to the columns, then L^-1 W. So eliminating all takes S' S, and
+their gradients and steps S' s and S dx with s = L^-1 a.
 
 R, p are the bodies' poses when the images were taken, twist (n, 6) their [angular velocity in B, velocity in W].
 """

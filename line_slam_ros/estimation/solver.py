@@ -33,6 +33,7 @@ from line_slam_ros.types import F64, LineForm
 
 TRACE = 1e-9  # information that holds what nothing says anything about
 TRUSTED = 0.5  # of the predicted change of the cost: a smaller error, and the Jacobians serve for another step
+LEAST_DAMPING = 1e-9  # too small to matter
 CONVERGED = 1.0  # change of the cost (half squared standard deviations) below which iterating ends
 
 
@@ -173,7 +174,7 @@ class Solver:
         self._rows = 0  # of S, s in use
         self._columns = np.zeros(column(slots))
         self._factor: F64 | None = None  # upper triangular, of H; empty: it has none; None: not computed yet
-        self._damping, self.linearised_with = 1e-6, 0.0  # linearised_with: damping that H and the landmarks' L hold
+        self.linearised_with = 0.0  # damping that H's factor and the landmarks' L hold
 
     def linearise(self, use_points, use_lines, damping: float = 0.0, links: tuple[int, int] | None = None) -> None:
         """Fill H and g from the chosen landmarks, the prior, links [first, last) and their rests.
@@ -223,7 +224,8 @@ class Solver:
             eliminate(kind.use, kind.size, damping, kind.L, kind.first, S)
         own = np.stack([J[:k].T @ J[:k] for J, k in zip(self._J[:n], self._count, strict=False)])
         add_hessian(n, own, S.T @ S, self.H)
-        _hold(self.H, np.flatnonzero(w.rig_sigma == 0.0))
+        if not w.rig_sigma.all():
+            _hold(self.H, np.flatnonzero(w.rig_sigma == 0.0))
 
     def _take_gradient(self) -> None:
         """g of the last evaluation, by the Jacobians taken last."""
@@ -251,11 +253,14 @@ class Solver:
 
     def _resting(self) -> tuple[np.ndarray, np.ndarray]:
         """Which states are at rest and have no velocity; which links between two of them have no length."""
-        still, n, (first, last) = self.window.still, self.window.n, self._links
-        return (first + np.flatnonzero(still[first:n if last == n - 1 else last]),
-                first + np.flatnonzero(still[first:last] & still[first + 1:last + 1]))
+        n, (first, last) = self.window.n, self._links
+        still = self.window.still[first:n if last == n - 1 else last]
+        both = self.window.still[first:last] & self.window.still[first + 1:last + 1]
+        return first + np.flatnonzero(still), first + np.flatnonzero(both)
 
     def _add_rest(self) -> None:
+        if not self.window.still.any():
+            return
         states, links = self._resting()
         speed, shift = np.eye(3) / self.options.still_speed**2, np.eye(3) / self.options.still_shift**2
         for k in states:
@@ -269,7 +274,10 @@ class Solver:
             self.H[b, a] -= shift
 
     def _add_rest_gradient(self) -> None:
-        w, (states, links) = self.window, self._resting()
+        w = self.window
+        if not w.still.any():
+            return
+        states, links = self._resting()
         for k in states:
             self.g[_part(k, 6)] += w.v[k] / self.options.still_speed**2
         for k in links:
@@ -279,7 +287,7 @@ class Solver:
 
     def _rest_cost(self) -> float:
         w, o, n = self.window, self.options, self.window.n
-        if not w.still[:n].any():
+        if not w.still.any():
             return 0.0
         both = w.still[:n - 1] & w.still[1:n]
         return 0.5 * float(np.sum((w.v[:n][w.still[:n]] / o.still_speed) ** 2)
@@ -300,24 +308,24 @@ class Solver:
     def optimise(self, iterations: int) -> float:
         """Up to that many steps; returns the final cost."""
         self._links = 0, self.window.n - 1
-        cost, trusted = self.cost(), False
+        cost, damping, trusted = self.cost(), LEAST_DAMPING, False
         for _ in range(iterations):
-            if not trusted:
-                self._take_jacobians(self._damping)
+            fresh = not trusted
+            if fresh:
+                self._take_jacobians(damping)
             self._take_gradient()
             before = self._save()
             predicted = self._step()
             new_cost = self._evaluate() if predicted > 0.0 else np.inf
             gain = cost - new_cost
+            trusted = abs(gain - predicted) < TRUSTED * predicted
             if gain > 0.0:
-                trusted, cost = abs(gain - predicted) < TRUSTED * predicted, new_cost
-                self._damping = max(0.1 * self._damping, 1e-9)
+                cost, damping = new_cost, max(0.1 * damping, LEAST_DAMPING)
             else:
-                trusted = False
                 self._restore(before)
                 self._evaluate()
-                self._damping = min(max(10.0 * self._damping, 1e-4), 1e4)
-            if abs(gain) < CONVERGED:
+                damping = min(max(10.0 * damping, 1e-4), 1e4) if fresh else damping
+            if min(abs(gain), predicted or np.inf) < CONVERGED:
                 break
         return cost
 

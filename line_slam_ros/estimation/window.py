@@ -53,6 +53,18 @@ def rig_difference(R_BC, p_BC, delay, R_given, p_given, delta):
     delta[6] = delay[0]
 
 
+@njit(cache=True, nogil=True, error_model='numpy')
+def whiten(cov, W):
+    """W = L^-1 with L L' = cov, both (9, 9): W' W = cov^-1."""
+    L = np.linalg.cholesky(cov + 1e-14 * np.eye(9))
+    W[:] = 0.0
+    for j in range(9):
+        W[j, j] = 1.0 / L[j, j]
+        for i in range(j + 1, 9):
+            for k in range(j, i):
+                W[i, j] -= L[i, k] * W[k, j] / L[i, i]
+
+
 def averaged(samples: Samples) -> Samples:
     """The same time and means in eleven samples: all that matters of a link at rest."""
     t, gyro, accel = samples
@@ -192,10 +204,11 @@ class Window:
         self.dt[link] = preintegrate(t, gyro, accel, self.b_lin[link, :3], self.b_lin[link, 3:],
                                      self.noise.gyro_density**2, self.noise.accel_density**2, self.dR[link],
                                      self.dp[link], self.dv[link], self.J_b[link], self.cov[link])
-        self.W[link] = np.linalg.inv(np.linalg.cholesky(self.cov[link] + 1e-14 * np.eye(9)))
+        whiten(self.cov[link], self.W[link])
         if self.dt[link] > REST_S and self.still[link] and self.still[link + 1]:
             self.W[link, 3:] = 0.0  # of lower triangular W, what is left whitens the rotation alone
-        self.w_b[link] = 1.0 / (np.repeat([self.noise.gyro_walk, self.noise.accel_walk], 3) * np.sqrt(self.dt[link]))
+        self.w_b[link, :3] = 1.0 / (self.noise.gyro_walk * np.sqrt(self.dt[link]))
+        self.w_b[link, 3:] = 1.0 / (self.noise.accel_walk * np.sqrt(self.dt[link]))
 
     def freeze(self, slots: np.ndarray) -> None:
         """Fix the linearisation point of states the prior is about to know."""
