@@ -13,8 +13,7 @@ from line_slam_ros.estimation.estimator import Estimator
 from line_slam_ros.estimation.stillness import Stillness
 from line_slam_ros.frontend.front_end import FrontEnd
 from line_slam_ros.geometry.camera import Camera
-from line_slam_ros.geometry.imu import between, longest_gap
-from line_slam_ros.geometry.lie import so3_exp
+from line_slam_ros.geometry.imu import between, longest_gap, turned
 from line_slam_ros.mapping.line_map import LineMap
 from line_slam_ros.types import (
     F64,
@@ -148,12 +147,8 @@ class Slam:
         if samples is None:
             return None
         t, gyro, _ = samples
-        steps = np.diff(t)[:, None] * (0.5 * (gyro[1:] + gyro[:-1]) - self.estimator.gyro_bias())
-        R_BpBn = np.eye(3)
-        for R in so3_exp(steps):
-            R_BpBn = R_BpBn @ R
         R_BC = self.estimator.window.R_BC
-        return R_BC.T @ R_BpBn.T @ R_BC
+        return R_BC.T @ turned(t, gyro, self.estimator.gyro_bias()).T @ R_BC
 
     def _map(self) -> None:
         """Hand the window's lines to the map, new ones with all their views; retire those that left it."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from line_slam_ros.factors.imu_factor import imu_jacobians, imu_residual
-from line_slam_ros.geometry.imu import between, preintegrate
+from line_slam_ros.geometry.imu import between, preintegrate, turned
 from line_slam_ros.geometry.lie import so3_exp, so3_log
 from line_slam_ros.types import ImuBatch
 
@@ -61,6 +61,12 @@ def oracle(motion, bias=BIAS):
 def difference(a, b):
     """[rotation, position, velocity] from b to a, rotation on the right."""
     return np.concatenate([so3_log(b[0].T @ a[0]), a[1] - b[1], a[2] - b[2]])
+
+
+@pytest.mark.parametrize('motion', MOTIONS)
+def test_the_turn_alone_is_that_of_the_preintegration(motion):
+    t, gyro, _ = samples(motion, 200)
+    np.testing.assert_allclose(turned(t, gyro, BIAS[:3]), ours(motion, 200).dR, atol=1e-13)
 
 
 def mean(preintegrated):

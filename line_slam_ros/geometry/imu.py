@@ -101,6 +101,19 @@ def _propagate(F, G, var_g, var_a, cov, J, FC):
             J[i, j] = FC[i, j]
 
 
+@njit(cache=True, nogil=True, error_model='numpy')
+def turned(t, gyro, bias):
+    """R_01 (3, 3): how the body turned over the samples t (N,) s, gyro (N, 3) rad/s, bias (3,) removed."""
+    R, step, by, product = np.eye(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    for k in range(len(t) - 1):
+        for i in range(3):
+            step[i] = (t[k + 1] - t[k]) * (0.5 * (gyro[k, i] + gyro[k + 1, i]) - bias[i])
+        exp_so3(step, by)
+        multiply(R, by, product)
+        R[:] = product
+    return R
+
+
 def between(imu: ImuBatch, start_ns: int, end_ns: int) -> tuple[F64, F64, F64]:
     """Samples of exactly [start_ns, end_ns], ends interpolated linearly: t (N,) s from start, gyro, accel (N, 3).
 
