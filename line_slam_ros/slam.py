@@ -30,7 +30,6 @@ from line_slam_ros.types import (
 )
 from line_slam_ros.warm_up import warm_up_estimator, warm_up_front_end
 
-NEEDS_POINTS = 'corners, which every start needs: set use_points to true, or give poses (pose_source: topic)'
 MAX_IMU_GAP_S = 0.2  # longer, and the motion in between is anyone's guess
 
 
@@ -122,7 +121,7 @@ class Slam:
     def _initialise(self, observations: Observations, samples: Samples | None, still: bool) -> Estimate | None:
         with self._timed('initialise'):
             started = self._bootstrap.add(observations, samples, self._stillness.mean_imu() if still else None)
-        self.waiting_for = self._bootstrap.waiting_for if self.config.use_points else NEEDS_POINTS
+        self.waiting_for = self._bootstrap.waiting_for
         if not started or samples is None:
             return None
         self.status, self.waiting_for = Status.TRACKING, ''

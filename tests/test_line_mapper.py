@@ -145,13 +145,13 @@ def test_a_start_needs_most_feet_in_front(rng):
     lines, poses = scene(rng, 5), walk(10)
     ends = np.stack([observed(lines, T, rng).ends for T in poses], axis=1)
     all_poses = np.broadcast_to(poses[None, :, :3], (5, 10, 3, 4))
-    count = np.full(5, 10)
-    found, origin, holds = start_from_planes(all_poses, ends, count, 0.03)
+    sigma, count = np.full((5, 10, 2), 1e-3), np.full(5, 10)
+    found, origin, holds = start_from_planes(all_poses, ends, sigma, count, 0.03)
     assert holds.all()
     np.testing.assert_allclose(across(found[:, None], lines - origin[:, None]), 0, atol=1e-9)
     mirrored = all_poses.copy()
     mirrored[..., :3] *= [-1, 1, -1]  # the cameras turn their backs: (x, y, z) -> (-x, y, -z) mirrors v
-    assert not start_from_planes(mirrored, ends * [1, -1], count, 0.03)[2].any()
+    assert not start_from_planes(mirrored, ends * [1, -1], sigma, count, 0.03)[2].any()
 
 
 def test_lines_contradicted_by_most_views_are_forgotten(rng):
@@ -260,7 +260,7 @@ def test_reset_starts_anew_and_takes_earlier_frames(mapper):
     mapper.reset('time jumped back')
     assert mapper.resets == 1 and mapper.status is Status.INITIALISING and mapper.waiting_for == 'time jumped back'
     assert len(mapper.line_map.segments()) == len(mapper.active_lines()) == 0
-    feed(mapper, 30)
+    feed(mapper)
     assert len(mapper.line_map.segments()) == 12
 
 

@@ -8,7 +8,7 @@ from line_slam_ros.config import Config
 from line_slam_ros.config import Points as PointOptions
 from line_slam_ros.simulation.features import Room, Sequence, Trajectory, calibration
 from line_slam_ros.slam import Slam
-from line_slam_ros.types import Frame, ImuBatch, Status
+from line_slam_ros.types import Frame, ImuBatch, PointObservations, Status
 
 BLACK = np.zeros((480, 640), np.uint8)
 
@@ -189,8 +189,29 @@ def test_after_a_loss_position_and_heading_go_on(mounting):
     np.testing.assert_allclose(after.T_WB[:3, :3], before.T_WB[:3, :3], atol=0.02)
 
 
-def test_without_points_it_says_that_a_start_needs_them(sequence):
-    slam = Slam(Config(use_points=False), calibration())
-    slam.front_end = Told()
-    out = feed(slam, replace(sequence, seconds=1.0))
-    assert all('use_points' in waits for *_, waits in out)
+NO_POINTS = PointObservations(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2)))
+
+
+def lines_alone(t, observations, imu):
+    return replace(observations, points=NO_POINTS), imu
+
+
+def test_lines_alone_start_at_rest_and_carry_the_estimate(slam):
+    sequence = Sequence(Trajectory.random(3, rest=1.5), Room.random(3, lines=240), calibration(), 10.0)
+    out = feed(slam, sequence, lines_alone)
+    found = [(t, e) for t, e, *_ in out if e is not None]
+    assert found[0][0] <= 1.0 and slam.resets == 0
+    t = np.array([t for t, _ in found])
+    p, true = np.stack([e.T_WB[:3, 3] for _, e in found]), sequence.trajectory.at(t)[1]
+    far = [np.linalg.norm(q - q[0], axis=1) for q in (p, true)]
+    assert far[1].max() > 0.5
+    np.testing.assert_allclose(far[0], far[1], atol=0.05)
+    keyframes = np.array([e.is_keyframe for _, e in found])
+    assert keyframes[t > 2.0].sum() > 12  # by parallax: by time it would be one a second
+    assert len(slam.line_map.segments()) >= 5
+
+
+def test_lines_alone_in_motion_are_told_to_hold_still(slam, sequence):
+    out = feed(slam, replace(sequence, seconds=3.0), lines_alone)
+    assert all(e is None for _, e, *_ in out)
+    assert 'hold still' in out[-1][3]

@@ -117,3 +117,11 @@ def test_a_rig_that_is_not_estimated_stays_and_the_others_do_not_see_it(solver):
     before = w.p_BC.copy()
     solver.optimise(2)
     assert (w.p_BC == before).all()
+
+
+def test_equations_without_a_solution_are_told(solver):
+    solver.linearise(np.ones(POINTS, bool), np.ones(LINES, bool))
+    solver.H[:] = -solver.H
+    for ask in (solver.covariance, lambda: solver.line_covariances(np.arange(LINES))):
+        with pytest.raises(np.linalg.LinAlgError, match='positive definite'):
+            ask()

@@ -6,7 +6,8 @@ from itertools import pairwise
 import numpy as np
 
 from line_slam_ros.estimation.estimator import Estimator
-from line_slam_ros.estimation.initialisation import Snapshot, Start, matches, merge_samples, start_in_motion, upright
+from line_slam_ros.estimation.initialisation import Snapshot, Start, merge_samples, start_in_motion, upright
+from line_slam_ros.estimation.shift import matches
 from line_slam_ros.estimation.stillness import SPAN_S
 from line_slam_ros.geometry.lie import so3_exp
 from line_slam_ros.types import F64, Calibration, Observations, Samples
@@ -19,7 +20,7 @@ MAX_INERTIAL_CHI2 = 2.5  # mean squared whitened inertial residual; 1 when right
 
 
 class Bootstrap:
-    """Start from rest as soon as the body is still, from motion as soon as scale is observable."""
+    """Start from rest as soon as the body is still, which needs no corners, from motion as soon as they show scale."""
 
     def __init__(self, estimator: Estimator, calibration: Calibration):
         self._estimator, self._calibration = estimator, calibration
@@ -73,7 +74,8 @@ class Bootstrap:
         shots = self._spread(self._options.window - 1, self._unbroken_ns)
         span = (now_ns - shots[0].t_ns) * 1e-9
         if span < needed:
-            self.waiting_for = f'texture: {MIN_MATCHES} corners tracked from image to image over {needed:.1f} s'
+            self.waiting_for = (f'texture: {MIN_MATCHES} corners tracked from image to image over {needed:.1f} s; '
+                                'lines alone need a start at rest: hold still for a second')
             return False
         if now_ns < self._next_try_ns:
             return False

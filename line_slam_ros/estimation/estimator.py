@@ -8,8 +8,9 @@ import numpy as np
 from line_slam_ros.config import Estimator as Options
 from line_slam_ros.estimation.initialisation import Snapshot, Start
 from line_slam_ros.estimation.marginalisation import drop_state, marginalise_oldest
+from line_slam_ros.estimation.shift import FEW_CORNERS, corner_shifts, segment_shifts
 from line_slam_ros.estimation.solver import LEAST_DAMPING, Solver, SolverOptions
-from line_slam_ros.estimation.triangulation import start_lines, start_points
+from line_slam_ros.estimation.triangulation import give_up_near, start_lines, start_points
 from line_slam_ros.estimation.window import RIG, Window, state_row
 from line_slam_ros.geometry.lie import rigid
 from line_slam_ros.geometry.line_forms import unit_world_lines
@@ -208,7 +209,10 @@ class Estimator:
                     int(o.line_form), q.values, q.origin, q.solved)
 
     def _cull(self) -> tuple[I64, I64]:
-        """Landmarks whose newest view fails the chi-square gate lose it; those mostly wrong go for good."""
+        """Landmarks whose newest view fails the chi-square gate lose it; those mostly wrong go for good.
+
+        Lines that fell into a camera that sees them start anew.
+        """
         w, n = self.window, self.window.n
         gate, gone = self.options.gate_chi2, []
         for table, chi2 in ((w.points, self.solver.points.chi2), (w.lines, self.solver.lines.chi2)):
@@ -220,6 +224,10 @@ class Estimator:
             dead = bad.any(axis=1) & ((views < 2) | (bad.sum(axis=1) > views) | bad[:, n - 1])
             gone.append(table.ids[:c][dead].copy())
             table.keep(~dead)
+        R, position = self.solver.exposed()
+        q = w.lines
+        give_up_near(n, R, position, w.R_BC, w.p_BC, q.solved[:q.count], q.seen, int(self.solver.options.line_form),
+                     q.values, q.origin)
         return gone[0], gone[1]
 
     def _forget_ended(self) -> None:
@@ -237,17 +245,20 @@ class Estimator:
         if w.still[n - 1]:
             return False
         a, b = n - 2, n - 1
-        t = w.points
-        both = t.seen[:t.count, a] & t.seen[:t.count, b]
-        now = t.seen[:t.count, b].sum()
         if (w.t_ns[b] - w.t_ns[a]) * 1e-9 > self.options.keyframe_max_s:
             return True
-        if both.sum() < max(0.5 * now, 1):
-            return bool(now > 0)
+        p, q = w.points, w.lines
+        both, now = p.seen[:p.count, a] & p.seen[:p.count, b], p.seen[:p.count, b].sum()
         R = w.R_BC.T @ w.R[a].T @ w.R[b] @ w.R_BC
-        rays = np.c_[t.z[:t.count, b][both], np.ones(both.sum())] @ R.T
-        parallax = np.linalg.norm(rays[:, :2] / rays[:, 2:] - t.z[:t.count, a][both], axis=1)
-        return float(np.mean(parallax)) * self.focal > self.options.keyframe_parallax_px
+        shifts = corner_shifts(p.z[:p.count, a][both], _turned(R, p.z[:p.count, b][both]))
+        if len(shifts) < FEW_CORNERS:
+            both, now = q.seen[:q.count, a] & q.seen[:q.count, b], now + q.seen[:q.count, b].sum()
+            then, sigma = q.z[:q.count, a][both], q.sigma[:q.count, a][both]
+            size, _ = segment_shifts(then, _turned(R, q.z[:q.count, b][both]), sigma, sigma)
+            shifts = np.concatenate([shifts, size])
+        if len(shifts) < max(0.5 * now, 1):
+            return bool(now > 0)
+        return float(np.mean(shifts)) * self.focal > self.options.keyframe_parallax_px
 
     def _health(self) -> str:
         """Why the estimate cannot be trusted any more, or ''."""
@@ -262,3 +273,9 @@ class Estimator:
             self._last_sight_ns = w.t_ns[k]
         blind = (w.t_ns[k] - self._last_sight_ns) * 1e-9
         return f'nothing followed from image to image for {blind:.1f} s' if blind > self.options.max_blind_s else ''
+
+
+def _turned(R_ab: F64, x: F64) -> F64:
+    """Bearings (..., 2) of camera b as one with the rotation of camera a and their own place would have them."""
+    rays = x @ R_ab[:, :2].T + R_ab[:, 2]
+    return rays[..., :2] / rays[..., 2:]

@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from scipy.optimize import brentq, least_squares
 
+from line_slam_ros.estimation.shift import matches
 from line_slam_ros.geometry.imu import preintegrate
 from line_slam_ros.geometry.lie import so3_exp
 from line_slam_ros.geometry.lie_kernels import exp_so3, multiply, multiply_transposed
@@ -58,12 +59,6 @@ def upright(up_B: F64) -> F64:
     if sine < 1e-9:
         return np.eye(3) if up[2] > 0.0 else np.diag([1.0, -1.0, -1.0])
     return so3_exp(axis / sine * np.arctan2(sine, up[2]))
-
-
-def matches(a: Observations, b: Observations) -> tuple[F64, F64]:
-    """Bearings (N, 2), (N, 2) of the corners both frames saw."""
-    _, i, j = np.intersect1d(a.points.ids, b.points.ids, assume_unique=True, return_indices=True)
-    return a.points.x[i], b.points.x[j]
 
 
 def start_in_motion(shots: list[Snapshot], T_BC: F64, noise: ImuNoise, gravity: float) -> Start | None:

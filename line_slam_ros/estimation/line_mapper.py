@@ -213,7 +213,7 @@ class LineEstimator:
         rows = rows[table['count'][rows] >= options.line_min_views]
         if not len(rows):
             return
-        lines, origin, holds = start_from_planes(table['poses'][rows], table['ends'][rows], table['count'][rows],
+        lines, origin, holds = start_from_planes(*(table[name][rows] for name in ('poses', 'ends', 'sigma', 'count')),
                                                  np.sin(np.radians(options.line_min_parallax_deg)))
         values, stored = np.empty((len(rows), VALUES)), np.empty(len(rows), np.bool_)
         store_lines(self._form, lines, table['poses'][rows, 0, :, :3], table['ends'][rows, 0], values, stored)

@@ -371,8 +371,11 @@ class Solver:
                 (w.lines.values, q)]
 
     def covariance(self) -> F64:
-        """(15, 15) of the newest state given everything in the window, by the equations linearised last."""
-        newest = np.linalg.inv(self._factored()[-STATE:, -STATE:])
+        """(15, 15) of the newest state given everything in the window, by the equations linearised last.
+
+        LinAlgError when these have no solution.
+        """
+        newest = np.linalg.inv(_regular(self._factored())[-STATE:, -STATE:])
         return newest @ newest.T
 
     def line_covariances(self, lines: np.ndarray) -> F64:
@@ -387,7 +390,7 @@ class Solver:
         seen = np.concatenate([np.arange(RIG), *(np.arange(state_row(k), state_row(k) + POSE) for k in range(n - 1))])
         ties = np.zeros((rows, len(seen)))
         ties[seen, np.arange(len(seen))] = 1.0
-        C = _solve(_cholesky(H), ties)[seen]
+        C = _solve(_regular(_cholesky(H)), ties)[seen]
         S = self._S[self.lines.first[lines, None] + np.arange(4), :len(seen)]
         inverse = np.linalg.inv(self.lines.L[lines]).transpose(0, 2, 1)
         AW = inverse @ S
@@ -410,6 +413,13 @@ def _cholesky(H: F64, damping: float = 0.0) -> F64:
     np.fill_diagonal(factor, (1.0 + damping) * np.diag(H) + TRACE)
     lower, info = dpotrf(factor.T, lower=1, clean=1, overwrite_a=1)
     return lower.T if info == 0 else np.zeros((0, 0))
+
+
+def _regular(factor: F64) -> F64:
+    """The factor, if there is one; LinAlgError if not."""
+    if not len(factor):
+        raise np.linalg.LinAlgError('not positive definite')
+    return factor
 
 
 def _solve(factor: F64, b: F64) -> F64:

@@ -2,8 +2,9 @@
 import numpy as np
 from numba import njit
 
-from line_slam_ros.geometry.line_forms import store_line
+from line_slam_ros.geometry.line_forms import store_line, world_line
 
+NEAREST = 0.05  # m from the camera: where a line that is seen cannot be
 SIGNIFICANT = 5.0  # standard deviations of an angle between observation planes that noise does not explain
 
 
@@ -86,12 +87,12 @@ def start_lines(n, R, p, R_BC, p_BC, todo, seen, z, sigma, min_sine, form, value
                 planes[k] = s * (R_WC[k, 0] * h[0] + R_WC[k, 1] * h[1] + R_WC[k, 2] * h[2])
                 normals[views, k] = planes[k]
                 planes[3] -= planes[k] * (p_WC[k] - origin[i, k])
-            noise2[views] = (sigma[i, f, 0] ** 2 + sigma[i, f, 1] ** 2) / ((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2)
+            noise2[views] = plane_variance(z[i, f], sigma[i, f])
             views += 1
             for k in range(4):
                 for j in range(4):
                     M[k, j] += planes[k] * planes[j]
-        if views < 2 or not _has_parallax(normals, noise2, views, min_sine):
+        if views < 2 or not has_parallax(normals, noise2, views, min_sine):
             continue
         _, V = np.linalg.eigh(M)
         if _line_through(V[:, 0], V[:, 1], nd) and _in_front(n, R, p, R_BC, p_BC, seen[i], z[i], nd, origin[i]):
@@ -101,10 +102,17 @@ def start_lines(n, R, p, R_BC, p_BC, todo, seen, z, sigma, min_sine, form, value
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def _has_parallax(normals, noise2, views, min_sine):
+def plane_variance(ends, sigma):
+    """Variance (rad^2) of a segment's plane about its bearing; ends (2, 2), normalised, with noise sigma (2,)."""
+    a, b = ends[0], ends[1]
+    return (sigma[0] ** 2 + sigma[1] ** 2) / ((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def has_parallax(normals, noise2, views, min_sine):
     """Whether two of the unit normals (views, 3), blind to their signs, differ by more than min_sine and significantly.
 
-    noise2 (views,): variance (rad^2) of a normal about its bearing, from the noise of the ends over the length.
+    noise2 (views,): their plane_variance.
     """
     for j in range(views):
         for k in range(j):
@@ -147,7 +155,30 @@ def _in_front(n, R, p, R_BC, p_BC, seen, z, nd, origin):
             N0, N1, N2 = -n_C[1], n_C[0], u * n_C[1] - v * n_C[0]
             w = d_C[0] * N0 + d_C[1] * N1 + d_C[2] * N2
             z_foot = (n_C[0] * N1 - n_C[1] * N0) / (-w) if w != 0.0 else -1.0
-            if not z_foot > 0.05:
+            if not z_foot > NEAREST:
                 return False
     return True
 
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def give_up_near(n, R, p, R_BC, p_BC, solved, seen, form, values, origin):
+    """Lines nearer than NEAREST to a camera that saw them have no estimate any more: solved (M,) becomes False.
+
+    Every segment agrees with a line through the camera's centre, so a line with little parallax can fall into it, and
+    seems more and more certain the nearer it comes.
+    """
+    R_WC, p_WC, n_W, d_W, J = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3), np.empty((6, 4))
+    for i in range(len(solved)):
+        if not solved[i]:
+            continue
+        world_line(form, values[i], origin[i], n_W, d_W, J)
+        length2 = d_W[0] ** 2 + d_W[1] ** 2 + d_W[2] ** 2
+        for f in range(n):
+            if not seen[i, f]:
+                continue
+            camera_pose(R[f], p[f], R_BC, p_BC, R_WC, p_WC)
+            m0 = n_W[0] - (p_WC[1] * d_W[2] - p_WC[2] * d_W[1])
+            m1 = n_W[1] - (p_WC[2] * d_W[0] - p_WC[0] * d_W[2])
+            m2 = n_W[2] - (p_WC[0] * d_W[1] - p_WC[1] * d_W[0])
+            if not m0 * m0 + m1 * m1 + m2 * m2 > NEAREST * NEAREST * length2:
+                solved[i] = False
