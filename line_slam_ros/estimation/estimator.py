@@ -106,13 +106,14 @@ class Estimator:
         return RigCorrection(float(np.degrees(np.linalg.norm(rig[:3]))), float(np.linalg.norm(rig[3:6])), float(rig[6]))
 
     def covariance(self) -> F64:
-        """(9, 9) of the newest state's [rotation in B, position in W, velocity in W].
+        """(9, 9) of the newest state's [rotation in B, position in W, velocity in W]."""
+        self._undamp()
+        return self.solver.covariance()[:9, :9]
 
-        By the equations of the last step, or by fresh ones when those were damped: damping is no knowledge.
-        """
+    def _undamp(self) -> None:
+        """Covariances are by the equations of the last step, or by fresh ones if those are damped: no knowledge."""
         if self.solver.linearised_with > LEAST_DAMPING:
             self.linearise()
-        return self.solver.covariance()[:9, :9]
 
     def last_good(self) -> tuple[F64, F64] | None:
         """Position (3,) and rotation R_WB (3, 3) of the newest finite state, None when there is none."""
@@ -130,12 +131,12 @@ class Estimator:
         return np.einsum('nij,nj->ni', t.R_WA[c], rays) + t.p_WA[c]
 
     def lines(self) -> WindowLines:
-        """Solved lines of the window with their covariance, the newest pose held fixed."""
-        self.linearise()
+        """The lines that took part in the last step, with their covariance, the newest pose held fixed."""
+        self._undamp()
         w, t, n = self.window, self.window.lines, self.window.n
-        rows = np.flatnonzero(t.solved[:t.count])
+        rows = np.flatnonzero(t.solved[:t.count] & (t.taken[:t.count] >= 0))
         pluecker, J = unit_world_lines(int(self.solver.options.line_form), t.values[rows], t.origin[rows])
-        cov = J @ self.solver.line_covariances(rows) @ J.transpose(0, 2, 1)
+        cov = J @ self.solver.line_covariances(t.taken[rows]) @ J.transpose(0, 2, 1)
         R_WB, p_WB = self.solver.exposed()
         T_WC = rigid(R_WB @ w.R_BC, p_WB + R_WB @ w.p_BC)
         return WindowLines(t.ids[rows], pluecker, cov, t.views[rows] + t.seen[rows, :n].sum(axis=1),

@@ -208,6 +208,8 @@ class Solver:
         p, q, kp, kl = w.points, w.lines, self.points, self.lines
         w.unfrozen_to_current()
         self.linearised_with, self._factor = damping, None
+        for table, kind in ((p, kp), (q, kl)):
+            table.taken[:table.count] = np.where(kind.use, np.arange(table.count), -1)
         self.H[:] = w.prior_H
         add_link_hessians(*self._links, w.R0, w.p0, w.v0, w.b0, w.dt, w.dR, w.dp, w.dv, w.J_b, w.b_lin, w.W, w.w_b,
                           o.g_W, self._link_J, self.H)
@@ -379,7 +381,7 @@ class Solver:
         return newest @ newest.T
 
     def line_covariances(self, lines: np.ndarray) -> F64:
-        """(L, 4, 4) of the lines in those rows, in their tangent, as the newest camera knows them; after a linearise.
+        """(L, 4, 4) of lines (rows when Jacobians were taken last) in their tangent, as the newest camera knows them.
 
         A^-1 + (A^-1 W) C (A^-1 W)' with W the ties to rig and poses and C the covariance of these, given the newest
         pose: where that pose is in the world is not the line's doubt, how the others stood to it is.

@@ -87,7 +87,8 @@ class LandmarkTable:
         self.sigma = np.ones((rows, slots, 2))  # their standard deviation
         self.solved = np.zeros(rows, np.bool_)  # has a 3D estimate and takes part in the optimisation
         self.views = np.zeros(rows, np.int64)  # keyframes that ever saw it, also those that left the window
-        self._columns = ['ids', 'seen', 'z', 'sigma', 'solved', 'views', *fields]
+        self.taken = np.full(rows, -1, np.int64)  # its row when Jacobians were taken last; -1: not there
+        self._columns = ['ids', 'seen', 'z', 'sigma', 'solved', 'views', 'taken', *fields]
         for name, shape in fields.items():
             setattr(self, name, np.zeros((rows, *shape)))
 
@@ -110,7 +111,8 @@ class LandmarkTable:
         self.seen[rows[used], slot], self.z[rows[used], slot], self.sigma[rows[used], slot] = True, z[used], sigma[used]
 
     def _clear_rows(self, first: int, last: int) -> None:
-        self.seen[first:last], self.solved[first:last], self.views[first:last] = False, False, 0
+        self.seen[first:last], self.solved[first:last] = False, False
+        self.views[first:last], self.taken[first:last] = 0, -1
 
     def remove_slot(self, slot: int, slots: int) -> None:
         """Forget what a slot saw and close the gap; slots = number of slots in use before."""
