@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Iterator
@@ -32,8 +33,10 @@ class FrameInbox(ABC, Generic[Companion]):
         """max_frames wait at most; time_offset = t_imu - t_camera in s; size (width, height) if it is to be checked."""
         self.drops: Counter[str] = Counter()  # reason -> messages dropped or missing
         self.jumped = False  # whether the pair handed out last is the first since time jumped back
+        self.waited = 0.0  # s, since the frame handed out last came in
         self._max_frames, self._offset_ns, self._size = max_frames, round(time_offset * 1e9), size
         self._frames: deque[Frame] = deque()
+        self._arrivals: deque[float] = deque()  # of these frames, s
         self._newest_frame = -1
         self._jump_pending = self._closed = False
         self._notes = Notes()
@@ -49,7 +52,15 @@ class FrameInbox(ABC, Generic[Companion]):
             if len(self._frames) == self._max_frames:
                 self._drop_oldest()
             self._frames.append(replace(frame, t_ns=t_ns))
+            self._arrivals.append(time.monotonic())
             self._wake_if_ready()
+
+    @property
+    def ready(self) -> int:
+        """Frames that wait though they could be taken: more than none, and the taker is late."""
+        with self._changed:
+            newest = self._newest_companion()
+            return sum(frame.t_ns <= newest for frame in self._frames)
 
     def expect_size(self, size: tuple[int, int]) -> None:
         """Check (width, height) from now on; a live calibration may come after the first messages."""
@@ -76,6 +87,7 @@ class FrameInbox(ABC, Generic[Companion]):
         with self._changed:
             newest = self._newest_companion()
             while self._frames and self._frames[-1].t_ns > newest:
+                self._arrivals.pop()
                 self._explain_missing(self._frames.pop().t_ns)
             self._closed = True
             self._changed.notify_all()
@@ -103,10 +115,11 @@ class FrameInbox(ABC, Generic[Companion]):
 
     def _next_pair(self) -> tuple[Frame, Companion] | None:
         while self._frames and self._frames[0].t_ns <= self._newest_companion():
-            frame = self._frames.popleft()
+            frame, arrival = self._frames.popleft(), self._arrivals.popleft()
             companion = self._companion(frame.t_ns)
             if companion is not None:
                 self.jumped, self._jump_pending = self._jump_pending, False
+                self.waited = time.monotonic() - arrival
                 return frame, companion
             self._reject(f'image without {self._companion_name}',
                          f'no {self._companion_name} data for an image: it came before the first message or in a gap',
@@ -128,6 +141,7 @@ class FrameInbox(ABC, Generic[Companion]):
     def _jump_back(self, seconds: float, what: str, t_ns: int) -> None:
         self.drops['image waiting when time jumped back'] += len(self._frames)
         self._frames.clear()
+        self._arrivals.clear()
         self._clear_companions()
         self._newest_frame, self._jump_pending = -1, True
         self._notes.tell('jump', f'{what} time jumped back by {seconds:.1f} s: starting again', t_ns)
@@ -142,6 +156,7 @@ class FrameInbox(ABC, Generic[Companion]):
         return True
 
     def _drop_oldest(self) -> None:
+        self._arrivals.popleft()
         t_ns = self._frames.popleft().t_ns
         if t_ns > self._newest_companion():
             self._explain_missing(t_ns)
@@ -179,7 +194,7 @@ class Inbox(FrameInbox[ImuBatch]):
     def imu(self, t_ns: int, gyro_B: Vector, accel_B: Vector) -> None:
         """An inertial sample came in: rad/s and m/s^2 (times accel_scale)."""
         with self._changed:
-            if not all(map(math.isfinite, (*gyro_B, *accel_B))):
+            if not math.isfinite(sum(gyro_B) + sum(accel_B)):
                 self._reject('IMU not finite', f'IMU sample holds NaN or infinity ({gyro_B}, {accel_B}); dropped. '
                              'Check the driver', t_ns)
                 return

@@ -4,7 +4,7 @@ World messages live in ``frame_id`` (REP 105: odom), the body is ``child_frame_i
 """
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -49,16 +49,6 @@ def pose_stamped(new: MessageFactory, t_ns: int, T_WB: F64, frame_id: str) -> An
     return new('geometry_msgs/msg/PoseStamped', header=header(new, t_ns, frame_id), pose=_pose(new, T_WB))
 
 
-def path(new: MessageFactory, poses: Iterable[tuple[int, F64]], t_ns: int, frame_id: str) -> Any:
-    """nav_msgs/Path of (t_ns, T_WB); about 100 us a pose."""
-    return path_of(new, [pose_stamped(new, t, T_WB, frame_id) for t, T_WB in poses], t_ns, frame_id)
-
-
-def path_of(new: MessageFactory, poses: Sequence[Any], t_ns: int, frame_id: str) -> Any:
-    """nav_msgs/Path of geometry_msgs/PoseStamped messages made before."""
-    return new('nav_msgs/msg/Path', header=header(new, t_ns, frame_id), poses=list(poses))
-
-
 def transform(new: MessageFactory, t_ns: int, T_AB: F64, frame_id: str, child_frame_id: str) -> Any:
     """geometry_msgs/TransformStamped: child B in parent A."""
     return new('geometry_msgs/msg/TransformStamped', header=header(new, t_ns, frame_id), child_frame_id=child_frame_id,
@@ -76,17 +66,15 @@ def clock(new: MessageFactory, t_ns: int) -> Any:
     return new('rosgraph_msgs/msg/Clock', clock=_time(new, t_ns))
 
 
-def lines_marker(new: MessageFactory, ends: F64, t_ns: int, frame_id: str, namespace: str = 'map',
-                 colour: Colour = MAP_COLOUR, width: float = 0.01) -> Any:
-    """visualization_msgs/Marker LINE_LIST of ends (L, 2, 3) m; one marker (namespace, 0), replaced each time."""
-    point = new.type('geometry_msgs/msg/Point')
-    return new('visualization_msgs/msg/Marker', header=header(new, t_ns, frame_id), ns=namespace, id=0,
+def lines_marker(new: MessageFactory, frame_id: str, namespace: str, colour: Colour, width: float) -> Any:
+    """visualization_msgs/Marker LINE_LIST without points, which marker_bytes.py adds; one marker (namespace, 0),
+    replaced each time."""
+    return new('visualization_msgs/msg/Marker', header=header(new, 0, frame_id), ns=namespace, id=0,
                type=_LINE_LIST, action=_ADD, pose=_pose(new, np.eye(4)), scale=_vector(new, (width, 0.0, 0.0)),
                color=_colour(new, colour), lifetime=new('builtin_interfaces/msg/Duration', sec=0, nanosec=0),
-               frame_locked=False,
-               points=[point(x=x, y=y, z=z) for x, y, z in np.asarray(ends, float).reshape(-1, 3).tolist()], colors=[],
+               frame_locked=False, points=[], colors=[],
                texture_resource='', texture=_no_image(new, frame_id), uv_coordinates=[], text='', mesh_resource='',
-               mesh_file=new('visualization_msgs/msg/MeshFile', filename='', data=np.zeros(0, np.uint8)),
+               mesh_file=new('visualization_msgs/msg/MeshFile', filename='', data=new.octets(np.zeros(0, np.uint8))),
                mesh_use_embedded_materials=False)
 
 
@@ -97,7 +85,7 @@ def points_cloud(new: MessageFactory, points_W: F64, t_ns: int, frame_id: str) -
              for i, name in enumerate('xyz')]
     return new('sensor_msgs/msg/PointCloud2', header=header(new, t_ns, frame_id), height=1, width=len(xyz),
                fields=field, is_bigendian=False, point_step=12, row_step=12 * len(xyz),
-               data=xyz.view(np.uint8).ravel(), is_dense=True)
+               data=new.octets(xyz.view(np.uint8).ravel()), is_dense=True)
 
 
 def image(new: MessageFactory, pixels: U8, t_ns: int, frame_id: str) -> Any:
@@ -105,13 +93,13 @@ def image(new: MessageFactory, pixels: U8, t_ns: int, frame_id: str) -> Any:
     height, width = pixels.shape[:2]
     return new('sensor_msgs/msg/Image', header=header(new, t_ns, frame_id), height=height, width=width,
                encoding='mono8' if pixels.ndim == 2 else 'bgr8', is_bigendian=0,
-               step=pixels.size // height, data=np.ascontiguousarray(pixels).ravel())
+               step=pixels.size // height, data=new.octets(np.ascontiguousarray(pixels).ravel()))
 
 
 def compressed_image(new: MessageFactory, data: bytes, encoding: str, t_ns: int, frame_id: str) -> Any:
     """sensor_msgs/CompressedImage of encoded bytes; encoding 'jpeg' or 'png'."""
     return new('sensor_msgs/msg/CompressedImage', header=header(new, t_ns, frame_id), format=encoding,
-               data=np.frombuffer(data, np.uint8))
+               data=new.octets(np.frombuffer(data, np.uint8)))
 
 
 def camera_info(new: MessageFactory, calibration: Calibration, t_ns: int, frame_id: str) -> Any:
@@ -184,7 +172,7 @@ def _colour(new: MessageFactory, colour: Colour) -> Any:
 
 def _no_image(new: MessageFactory, frame_id: str) -> Any:
     return new('sensor_msgs/msg/CompressedImage', header=header(new, 0, frame_id), format='',
-               data=np.zeros(0, np.uint8))
+               data=new.octets(np.zeros(0, np.uint8)))
 
 
 def _byte(new: MessageFactory, value: int) -> Any:

@@ -30,12 +30,12 @@ def factory(kind: str) -> MessageFactory:
 def image(new: MessageFactory, encoding: str, height: int, width: int, step: int, data: bytes,
           t_ns: int = 1_500_000_002, is_bigendian: int = 0) -> Any:
     return new('sensor_msgs/msg/Image', header=outputs.header(new, t_ns, 'cam0'), height=height, width=width,
-               encoding=encoding, is_bigendian=is_bigendian, step=step, data=np.frombuffer(data, np.uint8))
+               encoding=encoding, is_bigendian=is_bigendian, step=step, data=new.octets(np.frombuffer(data, np.uint8)))
 
 
 def compressed(new: MessageFactory, data: bytes, t_ns: int = 1_500_000_002) -> Any:
     return new('sensor_msgs/msg/CompressedImage', header=outputs.header(new, t_ns, 'cam0'), format='jpeg',
-               data=np.frombuffer(data, np.uint8))
+               data=new.octets(np.frombuffer(data, np.uint8)))
 
 
 def imu(new: MessageFactory, t_ns: int, gyro_B: Vector, accel_B: Vector) -> Any:

@@ -277,3 +277,24 @@ def test_size_can_be_expected_later():
     inbox.expect_size((4, 3))
     inbox.frame(frame(3, width=5))
     assert inbox.drops == {'image size differs from the calibration': 1}
+
+
+def test_ready_counts_the_frames_that_wait_for_the_taker_only():
+    inbox = Inbox(5)
+    for t in (3, 8, 20):
+        inbox.frame(frame(t))
+    feed(inbox, 0, 5, 10)
+    assert inbox.ready == 2  # the third waits for the IMU
+    inbox.take()
+    assert inbox.ready == 1
+
+
+def test_the_time_a_frame_waited_is_known(monkeypatch):
+    clock = iter([10.0, 10.5, 13.0, 13.25])
+    monkeypatch.setattr('line_slam_ros.inbox.time.monotonic', lambda: next(clock))
+    inbox = Inbox(1)
+    feed(inbox, 0, 5, 10)
+    inbox.frame(frame(3))
+    inbox.frame(frame(4))  # takes the place of the first
+    inbox.take()
+    assert inbox.waited == 2.5

@@ -5,11 +5,13 @@ from line_scene import clipped, looking, see, views
 
 from line_slam_ros.config import Mapping
 from line_slam_ros.geometry.lie import rigid_inverse
-from line_slam_ros.geometry.lines import transform_lines, trim
-from line_slam_ros.mapping.fusion import Landmark, across_covariance, fuse, offset, worst_sigma
+from line_slam_ros.geometry.lines import closest_point, transform_lines, trim
+from line_slam_ros.mapping.fusion import fuse, offsets, worst_sigma
 from line_slam_ros.mapping.line_map import VIEWS, LineMap
+from line_slam_ros.mapping.merging import KEPT_COLUMNS, Landmarks, Merging
 from line_slam_ros.mapping.table import IdTable
 from line_slam_ros.mapping.trimming import _foot
+from line_slam_ros.types import LineSegments
 
 
 @pytest.fixture
@@ -42,6 +44,15 @@ def add(line_map, rng, line_id, a, b, sigma=0.002, count=12, **how):
     line_map.refine(np.array([line_id]), pluecker_through(a, b)[None], covariance(a, b, sigma)[None],
                     np.array([count]))
     feed(line_map, rng, line_id, a, b, count, **how)
+
+
+def keep(line_map, line_id, a, b, sigma=0.001):
+    """Put a line among the kept ones, past trimming and merging."""
+    row = line_map._kept.put(line_id)
+    line = {'pluecker': pluecker_through(a, b), 'cov': covariance(a, b, sigma), 'ends': np.stack([a, b]), 'views': 9,
+            'sigma': sigma}
+    for name, value in line.items():
+        line_map._kept[name][row] = value
 
 
 def end_error(segments, a, b):
@@ -230,6 +241,72 @@ def test_an_active_duplicate_of_a_kept_line_is_shown_merged(rng):
     assert list(line_map.segments().ids) == [1] and list(line_map.active().ids) == [2]
 
 
+def landmarks(*lines):
+    """Of (id, a, b, sigma)."""
+    return Landmarks(np.array([i for i, *_ in lines]), np.stack([pluecker_through(a, b) for _, a, b, _ in lines]),
+                     np.stack([covariance(*line) for _, *line in lines]), np.array([[a, b] for _, a, b, _ in lines]),
+                     np.full(len(lines), 9), np.array([sigma for *_, sigma in lines]))
+
+
+def test_one_landmark_after_the_other_gives_the_map_of_all_at_once(rng):
+    """Among duplicates, pieces and namesakes, old and new; and the kept ones are untouched until commit."""
+    corners = rng.uniform([-2, 3, -1], [2, 5, 1], (12, 2, 3))
+    new = []
+    for k in range(40):
+        a, b = corners[k % 12] + rng.normal(scale=0.004, size=(2, 3))
+        share = rng.uniform(0.0, 0.5, 2)
+        new.append((501 + 10 * k, a + share[0] * (b - a), b - share[1] * (b - a), 0.005))
+    away = np.array([9.0, 0.0, 0.0])  # namesakes of kept lines elsewhere, a more certain and a less certain one
+    new += [(500, corners[0, 0] + away, corners[0, 1] + away, 0.003), (1000, A - away, B - away, 0.009)]
+    both = LineMap(Mapping()), LineMap(Mapping())
+    for line_map in both:
+        for k, (a, b) in enumerate(corners[:6]):
+            keep(line_map, 500 * k, a, b, 0.004)
+    before = {name: both[0]._kept[name].copy() for name in KEPT_COLUMNS}
+    merging = Merging(both[0]._kept, landmarks(*new), Mapping())
+    shown = merging.segments()
+    for name, column in before.items():
+        np.testing.assert_array_equal(both[0]._kept[name], column)
+    merging.commit()
+    for line in new:
+        Merging(both[1]._kept, landmarks(line), Mapping()).commit()
+    tables = [line_map._kept for line_map in both]
+    assert 12 <= len(shown) < 30 and 500 in shown.ids and 1000 in shown.ids
+    for name in ('pluecker', 'ends', 'views', 'sigma'):
+        at_once, one_by_one = (table[name][np.argsort(table.ids)] for table in tables)
+        np.testing.assert_array_equal(at_once, getattr(shown, name))
+        np.testing.assert_allclose(one_by_one, getattr(shown, name), atol=1e-9)
+
+
+def test_fusion_reaches_lines_far_from_the_window(rng):
+    """A line that grows by fusion meets kept lines where no active line is; a thousand others are in nobody's way."""
+    line_map, along = LineMap(Mapping()), B - A
+    pieces = [(0.9 * k, 0.9 * k + 1.0) for k in range(6)]  # each overlaps the next
+    for k in range(1000):
+        a = rng.uniform([-50, 10, -50], [50, 60, 50])
+        keep(line_map, 1000 + k, a, a + [1, 0, 0])
+    for k, (begin, end) in enumerate(pieces[1:]):
+        keep(line_map, 100 + k, A + begin * along, A + end * along)
+    add(line_map, rng, 5, *(A + np.outer(pieces[0], along)))
+    merged = line_map.segments()
+    assert list(merged.ids[:2]) == [5, 1000] and len(merged) == 1001
+    whole = LineSegments(merged.ids[:1], merged.pluecker[:1], merged.ends[:1], merged.views[:1], merged.sigma[:1])
+    assert end_error(whole, A, A + pieces[-1][1] * along) < 1e-6
+    line_map.retire(np.array([5]))
+    for name in ('ids', 'pluecker', 'ends', 'views', 'sigma'):
+        np.testing.assert_array_equal(getattr(line_map.segments(), name), getattr(merged, name))
+
+
+def test_what_changes_nothing_leaves_the_version(rng):
+    line_map = LineMap(Mapping())
+    add(line_map, rng, 1, A, B)
+    version = line_map.version
+    line_map.drop(np.array([7]))
+    line_map.retire(np.empty(0, np.int64))
+    line_map.segments()
+    assert line_map.version == version
+
+
 def test_an_id_that_comes_back_is_listed_once(rng):
     line_map = LineMap(Mapping())
     add(line_map, rng, 1, A, B)
@@ -267,12 +344,21 @@ def test_version_changes_with_the_map_and_clear_empties_it(rng):
     assert len(seen) == 4 and len(line_map.segments()) == 0
 
 
+def offset_from(pluecker, cov, point):
+    """From a point to its foot on a line: mean (3,) and covariance (3, 3)."""
+    mean, across = np.empty(3), np.empty((3, 3))
+    offsets(pluecker, cov, point[None], np.eye(3), mean, across)
+    return mean, across
+
+
 def test_across_covariance_agrees_with_samples(rng):
     pluecker, cov, point = pluecker_through(A, B), covariance(A, B, 0.01), A + 1.5 * (B - A)
     samples = np.stack([pluecker_through(*(np.stack([A, B]) + 0.01 * rng.normal(size=(2, 3)))) for _ in range(20000)])
-    moved = offset(samples, point)
-    np.testing.assert_allclose(np.cov(moved.T), across_covariance(pluecker, cov, point), atol=0.05 * 2.5e-4)
-    largest = np.sqrt(np.linalg.eigvalsh(across_covariance(pluecker, cov, point))[-1])
+    moved = closest_point(samples, point) - point
+    mean, across = offset_from(pluecker, cov, point)
+    np.testing.assert_allclose(mean, closest_point(pluecker, point) - point, atol=1e-12)
+    np.testing.assert_allclose(np.cov(moved.T), across, atol=0.05 * 2.5e-4)
+    largest = np.sqrt(np.linalg.eigvalsh(across)[-1])
     assert worst_sigma(pluecker[None], cov[None], np.stack([A, point])[None])[0] == pytest.approx(largest)
 
 
@@ -282,12 +368,13 @@ def test_fusion_is_the_maximum_likelihood_line(rng):
     normalised = []
     for _ in range(400):
         noisy = np.stack([A, B]) + 0.01 * rng.normal(size=(2, 3)), np.stack([a2, b2]) + 0.004 * rng.normal(size=(2, 3))
-        fused = fuse(Landmark(0, pluecker_through(*noisy[0]), covariance(*noisy[0], 0.01), noisy[0], 1, 0.01),
-                     Landmark(1, pluecker_through(*noisy[1]), covariance(*noisy[1], 0.004), noisy[1], 1, 0.004))
-        assert abs(fused.pluecker[:3] @ fused.pluecker[3:]) < 1e-12
+        pluecker, cov, ends = np.empty(6), np.empty((6, 6)), np.empty((2, 3))
+        sigma = fuse(pluecker_through(*noisy[0]), covariance(*noisy[0], 0.01), noisy[0],
+                     pluecker_through(*noisy[1]), covariance(*noisy[1], 0.004), noisy[1], pluecker, cov, ends)
+        assert abs(pluecker[:3] @ pluecker[3:]) < 1e-12
+        assert sigma == pytest.approx(worst_sigma(pluecker[None], cov[None], ends[None])[0])
         for point in (A, b2):
-            error = offset(fused.pluecker, point)
-            across = across_covariance(fused.pluecker, fused.cov, point)
+            error, across = offset_from(pluecker, cov, point)
             normalised.append(error @ np.linalg.pinv(across, rcond=1e-6) @ error)
     assert np.mean(normalised) == pytest.approx(2.0, abs=0.25)
 

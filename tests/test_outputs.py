@@ -59,30 +59,22 @@ def test_covariances_follow_the_ros_conventions():
     np.testing.assert_allclose(measured_twist, twist_covariance(estimate)[:3, :3], atol=0.5 * scale)
 
 
-def test_pose_path_and_transform(new):
+def test_pose_and_transform(new):
     estimate = samples.estimate()
     pose = outputs.pose(new, estimate, 'odom')
     np.testing.assert_array_equal(xyz(pose.pose.pose.position), estimate.T_WB[:3, 3])
-    path = outputs.path(new, [(1, np.eye(4)), (2, estimate.T_WB)], 5, 'odom')
-    assert [p.header.stamp.nanosec for p in path.poses] == [1, 2]
-    np.testing.assert_array_equal(xyz(path.poses[1].pose.position), estimate.T_WB[:3, 3])
+    stamped = outputs.pose_stamped(new, 7, estimate.T_WB, 'odom')
+    np.testing.assert_array_equal(xyz(stamped.pose.position), estimate.T_WB[:3, 3])
     transform = outputs.transform(new, 7, estimate.T_WB, 'odom', 'base_link')
     np.testing.assert_array_equal(xyz(transform.transform.translation), estimate.T_WB[:3, 3])
     assert (transform.header.frame_id, transform.child_frame_id) == ('odom', 'base_link')
-    assert all(map(serialise, (pose, path, transform)))
+    assert all(map(serialise, (pose, stamped, transform)))
 
 
-def test_lines_marker_is_a_list_of_point_pairs(new):
-    ends = np.random.default_rng(2).normal(size=(3, 2, 3))
-    marker = outputs.lines_marker(new, ends, 3, 'odom', 'active', outputs.ACTIVE_COLOUR)
+def test_lines_marker_waits_for_its_points(new):
+    marker = outputs.lines_marker(new, 'odom', 'active', outputs.ACTIVE_COLOUR, 0.02)
     assert (marker.type, marker.action, marker.ns) == (5, 0, 'active')
-    assert marker.pose.orientation.w == 1.0 and marker.color.a == 1.0 and marker.scale.x > 0.0
-    np.testing.assert_array_equal([xyz(p) for p in marker.points], ends.reshape(-1, 3))
-    assert serialise(marker)
-
-
-def test_an_empty_map_is_an_empty_marker(new):
-    marker = outputs.lines_marker(new, np.empty((0, 2, 3)), 3, 'odom')
+    assert marker.pose.orientation.w == 1.0 and marker.color.a == 1.0 and marker.scale.x == 0.02
     assert marker.points == [] and serialise(marker)
 
 

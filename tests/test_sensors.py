@@ -153,3 +153,23 @@ def test_a_pose_without_orientation_is_refused(new):
     message.pose.orientation.w = 0.0
     with pytest.raises(ValueError, match='quaternion'):
         sensors.pose_from_msg(message)
+
+
+@pytest.mark.parametrize('frame', ['', 'imu', 'imu0', 'imu_link', 'a_frame'])
+@pytest.mark.parametrize('little_endian', [True, False])
+def test_a_serialised_imu_message_is_read_without_making_it(frame, little_endian):
+    from rosbags.typesys import Stores, get_typestore
+    new, store = samples.factory('bag'), get_typestore(Stores.ROS2_JAZZY)
+    message = outputs.imu(new, 1_234_567_890_987_654_321, np.array([0.1, -0.2, 0.3]), np.array([1.0, 2.0, -9.8]), frame)
+    data = bytes(store.serialize_cdr(message, message.__msgtype__, little_endian=little_endian))
+    assert sensors.imu_of_cdr(data) == sensors.imu_fields(message)
+    for broken in (data[:-4], data[:12], b'', b'\0\3' + data[2:], data + bytes(8)):
+        with pytest.raises(ValueError, match='IMU message of'):
+            sensors.imu_of_cdr(broken)
+
+
+def test_an_imu_message_serialised_by_rclpy_is_read_the_same_way():
+    new = samples.factory('ros')
+    from rclpy.serialization import serialize_message
+    message = samples.imu(new, T_NS, (0.1, -0.2, 0.3), (1.0, 2.0, -9.8))
+    assert sensors.imu_of_cdr(serialize_message(message)) == sensors.imu_fields(message)

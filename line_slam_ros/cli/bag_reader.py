@@ -7,6 +7,7 @@ from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,10 @@ from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
+from line_slam_ros.cli.bag_topics import IMU
+from msg_adapters import sensors
+
+Decoder = Callable[[Any], Any]
 _BROKEN = (AnyReaderError, SerdeError, struct.error, ValueError, IndexError, KeyError, UnicodeDecodeError)
 
 
@@ -30,9 +35,12 @@ class Bag(AbstractContextManager['Bag']):
         self.undecodable: Counter[str] = Counter()  # topic -> messages that could not be read
         self._resources = ExitStack()
 
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, Any]]:
-        """(topic, message) of the chosen topics; messages that cannot be decoded are counted and left out."""
-        for topic, data, decode in self._raw(topics):
+    def messages(self, topics: Collection[str], imu: str = '') -> Iterator[tuple[str, Any]]:
+        """(topic, message) of the chosen topics; messages that cannot be decoded are counted and left out.
+
+        Of the topic ``imu`` come the fields (sensors.imu_fields) instead of the messages, ten times as fast.
+        """
+        for topic, data, decode in self._raw(topics, imu):
             try:
                 message = decode(data)
             except _BROKEN:
@@ -48,7 +56,7 @@ class Bag(AbstractContextManager['Bag']):
         self._resources.close()
 
     @abstractmethod
-    def _raw(self, topics: Collection[str]) -> Iterator[tuple[str, Any, Callable[[Any], Any]]]:
+    def _raw(self, topics: Collection[str], imu: str) -> Iterator[tuple[str, Any, Decoder]]:
         """(topic, serialised message, what decodes it)."""
 
 
@@ -64,12 +72,18 @@ class IndexedBag(Bag):
         for c in reader.connections:
             self.counts[c.topic] += c.msgcount
 
-    def _raw(self, topics: Collection[str]) -> Iterator[tuple[str, Any, Callable[[Any], Any]]]:
+    def _raw(self, topics: Collection[str], imu: str) -> Iterator[tuple[str, Any, Decoder]]:
         connections = [c for c in self._reader.connections if c.topic in topics]
         if not connections:
             return
+        decoders = {c.msgtype: partial(self._reader.deserialize, typ=c.msgtype) for c in connections}
+        of_imu = sensors.imu_of_cdr if self._reader.is2 else self._imu_of_ros1
         for connection, _, data in self._reader.messages(connections):
-            yield connection.topic, data, lambda raw, c=connection: self._reader.deserialize(raw, c.msgtype)
+            topic = connection.topic
+            yield topic, data, of_imu if topic == imu else decoders[connection.msgtype]
+
+    def _imu_of_ros1(self, data: bytes) -> Any:
+        return sensors.imu_fields(self._reader.deserialize(data, IMU))
 
     def log(self) -> Iterator[tuple[str, int, bytes]]:
         if not self._reader.is2:
@@ -105,9 +119,10 @@ class SalvagedBag(Bag):
                 except McapError:  # the break
                     continue
 
-    def _raw(self, topics: Collection[str]) -> Iterator[tuple[str, Any, Callable[[Any], Any]]]:
+    def _raw(self, topics: Collection[str], imu: str) -> Iterator[tuple[str, Any, Decoder]]:
         for schema, channel, message in self._records(topics):
-            yield channel.topic, message.data, lambda raw, s=schema: self._typestore.deserialize_cdr(raw, s.name)
+            yield channel.topic, message.data, (sensors.imu_of_cdr if channel.topic == imu else
+                                                partial(self._typestore.deserialize_cdr, typename=schema.name))
 
     def log(self) -> Iterator[tuple[str, int, bytes]]:
         for _, channel, message in self._records(None):

@@ -27,14 +27,17 @@ class BagWriter(AbstractContextManager['BagWriter']):
         self._writer.open()
         self.new = bag_messages(self._typestore)
 
-    def write(self, topic: str, t_ns: int, message: Any, latched: bool = False) -> None:
-        """Append a message made by ``new``; latched topics are offered transient local."""
-        data = self._typestore.serialize_cdr(message, message.__msgtype__)
-        self.write_serialised(topic, t_ns, message.__msgtype__, data, latched)
+    def serialise(self, message: Any) -> memoryview:
+        """CDR of a message made by ``new``."""
+        return self._typestore.serialize_cdr(message, message.__msgtype__)
+
+    def write(self, topic: str, t_ns: int, message: Any) -> None:
+        """Append a message made by ``new``."""
+        self.write_serialised(topic, t_ns, message.__msgtype__, self.serialise(message))
 
     def write_serialised(self, topic: str, t_ns: int, type_name: str, data: bytes | memoryview,
                          latched: bool = False) -> None:
-        """Append a message that is CDR already, as a raw subscription hands it out."""
+        """Append a message that is CDR already; latched topics are offered transient local."""
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(
                 topic, type_name, typestore=self._typestore, offered_qos_profiles=[_qos(latched)])

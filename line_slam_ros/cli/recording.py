@@ -7,7 +7,10 @@ from typing import Any
 from line_slam_ros.cli.bag_writer import BagWriter
 from line_slam_ros.types import F64, Estimate
 from msg_adapters import outputs
+from msg_adapters.marker_bytes import LineMarkers
+from msg_adapters.path_bytes import PathBytes
 
+_LINE_WIDTH = 0.01  # m
 _PATH_POSES = 1000  # a longer path is thinned out
 _PERIOD_NS = 1_000_000_000  # of map, path, points and diagnostics
 
@@ -18,7 +21,9 @@ class Recording:
     def __init__(self, writer: BagWriter, odom_frame: str, body_frame: str, namespace: str = '/line_slam') -> None:
         self._writer, self._new = writer, writer.new
         self._odom, self._body, self._namespace = odom_frame, body_frame, namespace
-        self._path: list[tuple[int, F64]] = []
+        self._markers = LineMarkers(writer.new, writer.serialise, odom_frame, _LINE_WIDTH)
+        self._path_of = PathBytes(odom_frame)
+        self._path: list[bytes] = []  # poses
         self._every = 1  # of the estimates go into the path
         self._estimates = 0
         self._state_ns = -_PERIOD_NS
@@ -48,19 +53,20 @@ class Recording:
         self._write_world(t_ns, slam)
 
     def _write_world(self, t_ns: int, slam: Any) -> None:
-        whole, active = slam.line_map.segments(), slam.active_lines()
-        self._write('lines', t_ns, outputs.lines_marker(self._new, whole.ends, t_ns, self._odom), latched=True)
-        marker = outputs.lines_marker(self._new, active.ends, t_ns, self._odom, 'active', outputs.ACTIVE_COLOUR, 0.015)
-        self._write('lines', t_ns, marker, latched=True)
+        for marker in self._markers(t_ns, slam.line_map.segments().ends, slam.active_lines().ends):
+            self._write_serialised('lines', t_ns, 'visualization_msgs/msg/Marker', marker, latched=True)
         self._write('points', t_ns, outputs.points_cloud(self._new, slam.points(), t_ns, self._odom))
-        self._write('path', t_ns, outputs.path(self._new, self._path, t_ns, self._odom))
+        self._write_serialised('path', t_ns, 'nav_msgs/msg/Path', self._path_of(t_ns, self._path))
 
     def _extend_path(self, t_ns: int, T_WB: F64) -> None:
         if self._estimates % self._every == 0:
-            self._path.append((t_ns, T_WB))
+            self._path.append(self._path_of.pose(t_ns, T_WB))
         self._estimates += 1
         if len(self._path) > _PATH_POSES:
             self._path, self._every = self._path[::2], 2 * self._every
 
-    def _write(self, name: str, t_ns: int, message: Any, latched: bool = False) -> None:
-        self._writer.write(f'{self._namespace}/{name}', t_ns, message, latched)
+    def _write(self, name: str, t_ns: int, message: Any) -> None:
+        self._writer.write(f'{self._namespace}/{name}', t_ns, message)
+
+    def _write_serialised(self, name: str, t_ns: int, type_name: str, data: bytes, latched: bool = False) -> None:
+        self._writer.write_serialised(f'{self._namespace}/{name}', t_ns, type_name, data, latched)

@@ -84,6 +84,7 @@ class Run(ABC):
 
     slam: Slam | LineMapper
     inbox: Inbox | PoseInbox
+    imu_topic = ''
 
     def __init__(self, topics: Topics, stream: DegradedStream) -> None:
         self._topics, self._stream = topics, stream
@@ -115,7 +116,8 @@ class Run(ABC):
                 yield processed
 
     @abstractmethod
-    def _motion(self, message: Any) -> None: ...
+    def _motion(self, message: Any) -> None:
+        """A pose message, or the fields of an inertial sample."""
 
     @abstractmethod
     def _process(self, frame: Frame, companion: Any) -> tuple[Frame, ImuBatch | None, Estimate | None]: ...
@@ -127,12 +129,13 @@ class ImuRun(Run):
     def __init__(self, config: Config, shell: ShellConfig, calibration: Calibration, topics: Topics,
                  stream: DegradedStream) -> None:
         super().__init__(topics, stream)
+        self.imu_topic = topics.motion
         self.slam = Slam(config, calibration)
         self.inbox = Inbox(_WAITING, calibration.time_offset, (calibration.width, calibration.height),
                            shell.accel_scale, _IMU_CAPACITY)
 
     def _motion(self, message: Any) -> None:
-        self.inbox.imu(*self._stream.imu(*sensors.imu_fields(message)))
+        self.inbox.imu(*self._stream.imu(*message))
 
     def _process(self, frame: Frame, imu: ImuBatch) -> tuple[Frame, ImuBatch | None, Estimate | None]:
         return frame, imu, self.slam.process(frame, imu)
@@ -159,7 +162,7 @@ def _run_through(bag: Bag, clip: Clip, topics: Topics, run: Run, results: Result
     wanted = (topics.image, topics.motion)
     total = sum(bag.counts[topic] for topic in wanted)
     with closing(tqdm(total=total, unit='msg', desc='replay', dynamic_ncols=True, mininterval=0.5)) as progress:
-        for topic, message in clip.of(bag.messages(wanted)):
+        for topic, message in clip.of(bag.messages(wanted, run.imu_topic)):
             progress.update()
             run.feed(topic, message)
             _collect(run, results)

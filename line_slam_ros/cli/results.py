@@ -6,7 +6,6 @@ from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import Any
 
-from line_slam_ros.cli import figure
 from line_slam_ros.cli.bag_writer import mcap_file
 from line_slam_ros.cli.metrics import Metrics
 from line_slam_ros.cli.recording import Recording
@@ -88,6 +87,7 @@ class Results(AbstractContextManager['Results']):
         write_csv(self._directory / 'lines.csv', segments)
         write_ply(self._directory / 'lines.ply', segments)
         if self._positions and self._with_figure:
+            from line_slam_ros.cli import figure  # half a second of Matplotlib
             figure.save(self._directory / 'figure.png', self._best_image, self._positions, segments)
         report = self._metrics.report(len(segments), self._inbox.drops, self.notes, self._slam)
         (self._directory / 'metrics.json').write_text(json.dumps(report, indent=2) + '\n', encoding='utf-8')

@@ -13,6 +13,7 @@ Formulas: Sola, Deray, Atchuthan, "A micro Lie theory for state estimation in ro
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike
 
 from line_slam_ros.types import F64
@@ -20,9 +21,10 @@ from line_slam_ros.types import F64
 
 def hat(w: ArrayLike) -> F64:
     """Matrix of the cross product, (..., 3) to (..., 3, 3): hat(a) @ b == cross(a, b)."""
-    x, y, z = np.moveaxis(np.asarray(w, float), -1, 0)
-    o = np.zeros_like(x)
-    return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1).reshape(*x.shape, 3, 3)
+    w = np.asarray(w, float)
+    W = np.zeros((*w.shape, 3))
+    W[..., 2, 1], W[..., 0, 2], W[..., 1, 0] = w[..., 0], w[..., 1], w[..., 2]
+    return W - np.swapaxes(W, -1, -2)
 
 
 def so3_exp(w: ArrayLike) -> F64:
@@ -74,17 +76,34 @@ def quaternion_from_matrix(R: ArrayLike) -> F64:
     The matrix gives all products 4 q_i q_j; the column of the largest square is q up to scale (Shepperd, 1978).
     """
     R = np.asarray(R, float)
-    trace = np.trace(R, axis1=-2, axis2=-1)
-    products = R + np.swapaxes(R, -1, -2) + (1.0 - trace)[..., None, None] * np.eye(3)
-    wx, wy, wz = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
-    with_w = np.stack([wx, wy, wz], axis=-1)
-    columns = np.concatenate([
-        np.concatenate([products, with_w[..., None]], axis=-1),
-        np.concatenate([with_w, (1.0 + trace)[..., None]], axis=-1)[..., None, :]], axis=-2)
-    largest = np.argmax(np.diagonal(columns, axis1=-2, axis2=-1), axis=-1)
-    q_xyzw = np.take_along_axis(columns, largest[..., None, None], axis=-2)[..., 0, :]
-    q_xyzw = q_xyzw * np.where(q_xyzw[..., 3:] < 0.0, -1.0, 1.0)
-    return q_xyzw / np.linalg.norm(q_xyzw, axis=-1, keepdims=True)
+    q_xyzw = np.empty((*R.shape[:-2], 4))
+    _quaternions(np.ascontiguousarray(R).reshape(-1, 3, 3), q_xyzw.reshape(-1, 4))
+    return q_xyzw
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _quaternions(R, q_xyzw):
+    """Fills q_xyzw (N, 4) from R (N, 3, 3)."""
+    column = np.empty(4)
+    for i in range(len(R)):
+        trace = R[i, 0, 0] + R[i, 1, 1] + R[i, 2, 2]
+        largest, square = 3, 1.0 + trace
+        for k in range(2, -1, -1):
+            if 2.0 * R[i, k, k] + (1.0 - trace) >= square:
+                largest, square = k, 2.0 * R[i, k, k] + (1.0 - trace)
+        for k in range(3):
+            skew = R[i, (k + 2) % 3, (k + 1) % 3] - R[i, (k + 1) % 3, (k + 2) % 3]
+            if largest == 3:
+                column[k] = skew
+            else:
+                column[k] = square if k == largest else R[i, k, largest] + R[i, largest, k]
+                if k == largest:
+                    column[3] = skew
+        if largest == 3:
+            column[3] = square
+        norm = np.sqrt(column[0] ** 2 + column[1] ** 2 + column[2] ** 2 + column[3] ** 2)
+        for k in range(4):
+            q_xyzw[i, k] = (-column[k] if column[3] < 0.0 else column[k]) / norm
 
 
 def rigid(R_AB: ArrayLike, p_AB: ArrayLike) -> F64:

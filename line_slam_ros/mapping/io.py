@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import csv
+import time
 from pathlib import Path
 
 import numpy as np
@@ -10,16 +11,22 @@ from line_slam_ros.types import LineSegments
 
 HEADER = ['id', 'x1_m', 'y1_m', 'z1_m', 'x2_m', 'y2_m', 'z2_m', 'views', 'sigma_m',
           'nx_m', 'ny_m', 'nz_m', 'dx', 'dy', 'dz']
+BLOCK = 16  # rows
 
 
-def write_csv(path: str | Path, lines: LineSegments) -> None:
-    """One row per line under a header: end points, number of views, sigma, Pluecker moment and direction (world)."""
+def write_csv(path: str | Path, lines: LineSegments, pause_s: float = 0.0) -> None:
+    """One row per line under a header: end points, number of views, sigma, Pluecker moment and direction (world).
+
+    Between blocks of rows it sleeps for pause_s, so that other threads hardly wait for the interpreter.
+    """
+    columns = lines.ids, lines.ends.reshape(-1, 6), lines.views, lines.sigma, lines.pluecker
     with open(path, 'w', newline='', encoding='utf-8') as file:
-        rows = csv.writer(file, lineterminator='\n')
-        rows.writerow(HEADER)
-        for k in range(len(lines)):
-            rows.writerow([int(lines.ids[k]), *map(repr, lines.ends[k].ravel().tolist()), int(lines.views[k]),
-                           repr(float(lines.sigma[k])), *map(repr, lines.pluecker[k].tolist())])
+        file.write(','.join(HEADER) + '\n')
+        for begin in range(0, len(lines), BLOCK):
+            rows = zip(*(column[begin: begin + BLOCK].tolist() for column in columns), strict=True)
+            file.writelines(','.join(map(repr, (line_id, *ends, views, sigma, *pluecker))) + '\n'
+                            for line_id, ends, views, sigma, pluecker in rows)
+            time.sleep(pause_s)
 
 
 def read_csv(path: str | Path) -> LineSegments:

@@ -1,18 +1,20 @@
 """The line map: landmarks being estimated, landmarks kept, and what of both is good enough to show."""
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from line_slam_ros.config import Mapping
-from line_slam_ros.mapping.fusion import Landmark, agree, fuse, near, worst_sigma
+from line_slam_ros.mapping.fusion import worst_sigma
+from line_slam_ros.mapping.merging import KEPT_COLUMNS, Landmarks, Merging
 from line_slam_ros.mapping.table import IdTable
 from line_slam_ros.mapping.trimming import trim
 from line_slam_ros.mapping.views import add_view, view_columns
 from line_slam_ros.types import F64, I64, LineSegments
 
 VIEWS = 64  # kept of each active landmark for its trimming
-LINE_COLUMNS = {'pluecker': ((6,), np.float64), 'cov': ((6, 6), np.float64), 'views': ((), np.int64)}
-KEPT_COLUMNS = {**LINE_COLUMNS, 'ends': ((2, 3), np.float64), 'sigma': ((), np.float64)}
+ACTIVE_COLUMNS = {'pluecker': ((6,), np.float64), 'cov': ((6, 6), np.float64), 'views': ((), np.int64)}
 
 
 class LineMap:
@@ -23,10 +25,10 @@ class LineMap:
 
     def __init__(self, config: Mapping) -> None:
         self._config = config
-        self._active = IdTable(**LINE_COLUMNS, **view_columns(VIEWS))
+        self._active = IdTable(**ACTIVE_COLUMNS, **view_columns(VIEWS))
         self._kept = IdTable(**KEPT_COLUMNS)
         self._version = 0
-        self._trimmed: tuple[int, list[Landmark]] = (0, [])
+        self._trimmed: tuple[int, Landmarks] | None = None  # with the version
         self._shown: tuple[int, LineSegments] = (0, LineSegments.empty())
 
     @staticmethod
@@ -36,7 +38,7 @@ class LineMap:
         scratch.refine(np.array([0]), line[None], np.zeros((1, 6, 6)), np.array([config.min_views]))
         scratch.observe(np.array([0]), np.array([[[-0.1, 0.0], [0.1, 0.0]]]), np.eye(4))
         scratch.active()
-        duplicate(scratch._kept, Landmark(1, line, np.zeros((6, 6)), np.zeros((2, 3)), 0, 0.0), config)
+        scratch.segments()
 
     @property
     def version(self) -> int:
@@ -67,34 +69,23 @@ class LineMap:
     def retire(self, ids: I64) -> None:
         """These left the window: keep them, merged with what is kept, or drop them, by quality; unknown ids are
         skipped."""
-        gone = {int(i) for i in ids if i in self._active}
-        for landmark in self._good():
-            if landmark.id in gone:
-                keep(self._kept, landmark, self._config)
-        for i in sorted(gone):
-            self._active.remove(i)
-        self._version += 1
+        rows = self._active.rows(np.unique(ids))
+        rows = rows[rows >= 0]
+        Merging(self._kept, self._trim(rows), self._config).commit()
+        self._forget(self._active.ids[rows].tolist())
 
     def drop(self, ids: I64) -> None:
         """These were wrong: forget what is active of them; unknown ids are skipped."""
-        for i in {int(i) for i in ids if i in self._active}:
-            self._active.remove(i)
-        self._version += 1
+        self._forget({int(i) for i in ids if i in self._active})
 
     def active(self) -> LineSegments:
         """The landmarks in the window that are good enough for the map, by id, not merged with the kept ones."""
-        table = self._kept.like()
-        for landmark in self._good():
-            put(table, landmark)
-        return to_segments(table)
+        return self._good().segments()
 
     def segments(self) -> LineSegments:
         """The map by id: what would be kept if every active landmark left the window now."""
         if self._shown[0] != self._version:
-            table = self._kept.copy()
-            for landmark in self._good():
-                keep(table, landmark, self._config)
-            self._shown = self._version, to_segments(table)
+            self._shown = self._version, Merging(self._kept, self._good(), self._config).segments()
         return self._shown[1]
 
     def clear(self) -> None:
@@ -103,59 +94,26 @@ class LineMap:
         self._kept.clear()
         self._version += 1
 
-    def _good(self) -> list[Landmark]:
+    def _good(self) -> Landmarks:
         """The active landmarks that may enter the map, trimmed, by id."""
-        if self._trimmed[0] != self._version:
-            self._trimmed = self._version, self._trim()
+        if self._trimmed is None or self._trimmed[0] != self._version:
+            self._trimmed = self._version, self._trim(np.argsort(self._active.ids))
         return self._trimmed[1]
 
-    def _trim(self) -> list[Landmark]:
+    def _forget(self, ids: Iterable[int]) -> None:
+        for i in ids:
+            self._active.remove(i)
+            self._version += 1
+
+    def _trim(self, rows: I64) -> Landmarks:
+        """Those of the active landmarks in rows that may enter the map, trimmed."""
         rule, table = self._config, self._active
-        pluecker, cov, views, ids = table['pluecker'], table['cov'], table['views'], table.ids
-        extents, parallax = np.empty((len(table), 2)), np.empty(len(table))
-        trim(pluecker, table['poses'], table['ends'], table['count'], rule.max_range_m, rule.end_share,
-             1e-3 * rule.end_sigma_mrad, extents, parallax)
-        foot = np.cross(pluecker[:, 3:], pluecker[:, :3])  # of the world's origin
-        ends = foot[:, None] + extents[..., None] * pluecker[:, None, 3:]
+        ends, parallax = np.empty((len(rows), 2, 3)), np.empty(len(rows))
+        trim(rows, table['pluecker'], table['poses'], table['ends'], table['count'], rule.max_range_m, rule.end_share,
+             1e-3 * rule.end_sigma_mrad, ends, parallax)
+        pluecker, cov, views = (table[name][rows] for name in ('pluecker', 'cov', 'views'))
         sigma = worst_sigma(pluecker, cov, ends)
         good = ((views >= rule.min_views) & (sigma <= rule.max_sigma_m)
                 & (parallax >= np.radians(rule.min_parallax_deg))
-                & (extents[:, 1] - extents[:, 0] >= rule.min_length_m))
-        return [Landmark(int(ids[k]), pluecker[k].copy(), cov[k].copy(), ends[k], int(views[k]), float(sigma[k]))
-                for k in np.flatnonzero(good)[np.argsort(ids[good])]]
-
-
-def keep(table: IdTable, landmark: Landmark, rule: Mapping) -> None:
-    """Add a landmark to the kept ones, fused with every duplicate among them; the lowest id survives. Of two under one
-    id that are not the same line, the more certain one stays."""
-    twin = duplicate(table, landmark, rule)
-    while twin is not None:
-        table.remove(twin.id)
-        landmark = fuse(twin, landmark)
-        twin = duplicate(table, landmark, rule)
-    namesake = table.rows([landmark.id])[0]
-    if namesake < 0 or landmark.sigma < table['sigma'][namesake]:
-        put(table, landmark)
-
-
-def put(table: IdTable, landmark: Landmark) -> None:
-    """Write a landmark to its row of a table of kept ones."""
-    row = table.put(landmark.id)
-    for name in KEPT_COLUMNS:
-        table[name][row] = getattr(landmark, name)
-
-
-def duplicate(table: IdTable, landmark: Landmark, rule: Mapping) -> Landmark | None:
-    """The nearest kept landmark that is the same line, if any."""
-    for row in near(landmark, table['pluecker'], table['ends'], rule):
-        other = Landmark(int(table.ids[row]), *(table[name][row].copy() for name in ('pluecker', 'cov', 'ends')),
-                         int(table['views'][row]), float(table['sigma'][row]))
-        if agree(landmark, other, rule):
-            return other
-    return None
-
-
-def to_segments(table: IdTable) -> LineSegments:
-    """A table of kept landmarks, by id."""
-    rows = np.argsort(table.ids)
-    return LineSegments(table.ids[rows], *(table[name][rows] for name in ('pluecker', 'ends', 'views', 'sigma')))
+                & (np.sum((ends[:, 1] - ends[:, 0]) * pluecker[:, 3:], axis=1) >= rule.min_length_m))
+        return Landmarks(*(column[good] for column in (table.ids[rows], pluecker, cov, ends, views, sigma)))

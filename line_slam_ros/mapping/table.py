@@ -64,17 +64,6 @@ class IdTable:
             column[row] = column[last]
         self._row_of[int(self._ids[row])] = row
 
-    def like(self) -> IdTable:
-        """An empty table with the same columns."""
-        return IdTable(**{name: (column.shape[1:], column.dtype) for name, column in self._columns.items()})
-
-    def copy(self) -> IdTable:
-        """An independent table with the same records."""
-        twin = self.like()
-        twin._columns = {name: column.copy() for name, column in self._columns.items()}
-        twin._ids, twin._row_of = self._ids.copy(), self._row_of.copy()
-        return twin
-
     def clear(self) -> None:
         self._row_of.clear()
 

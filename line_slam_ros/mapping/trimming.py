@@ -24,19 +24,20 @@ SPREAD = 3.5  # half width of a cluster of views, standard deviations
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def trim(pluecker, poses, ends, count, furthest, share, noise, extents, parallax):
-    """Extent of each line from its views.
+def trim(rows, pluecker, poses, ends, count, furthest, share, noise, trimmed, parallax):
+    """End points of the lines in rows (R,) from their views.
 
     pluecker (L, 6) in W with |d| = 1; poses (L, K, 3, 4), ends (L, K, 2, 2), count (L,): the views; furthest: range
     gate, m; share: part of the views that must confirm an end; noise: smallest standard deviation of an observed end
-    along the line, rad. Fills extents (L, 2): positions p . d of the two ends along the line, NaN without usable
-    views; parallax (L,): angle about the line between the extreme cameras, rad.
+    along the line, rad. Fills trimmed (R, 2, 3): the two ends in W, the first at the smaller p . d, NaN without usable
+    views; parallax (R,): angle about the line between the extreme cameras, rad.
     """
     capacity = poses.shape[1]
     low, high, tol_low, tol_high = np.empty(capacity), np.empty(capacity), np.empty(capacity), np.empty(capacity)
     across, order = np.empty(2 * capacity), np.empty(2 * capacity, np.int64)
     foot = np.empty(3)
-    for i in range(len(pluecker)):
+    for r in range(len(rows)):
+        i = rows[r]
         n, d = pluecker[i, :3], pluecker[i, 3:]
         lows, highs, residuals = 0, 0, 0
         for k in range(count[i]):
@@ -55,9 +56,12 @@ def trim(pluecker, poses, ends, count, furthest, share, noise, extents, parallax
         if residuals > 0:  # a landmark whose segments scatter across the line scatters along it, too
             _sort(across[:residuals], order)
             sigma = max(noise, 1.4826 * across[order[residuals // 2]])  # of a normal distribution, from the median
-        extents[i, 0] = -_outermost(low[:lows], tol_low[:lows], SPREAD * sigma, share, order)
-        extents[i, 1] = _outermost(high[:highs], tol_high[:highs], SPREAD * sigma, share, order)
-        parallax[i] = _parallax(n, d, poses[i, : count[i]])
+        begin = -_outermost(low[:lows], tol_low[:lows], SPREAD * sigma, share, order)
+        end = _outermost(high[:highs], tol_high[:highs], SPREAD * sigma, share, order)
+        for c in range(3):
+            nearest = d[c - 2] * n[c - 1] - d[c - 1] * n[c - 2]  # to the world's origin: d x n
+            trimmed[r, 0, c], trimmed[r, 1, c] = nearest + begin * d[c], nearest + end * d[c]
+        parallax[r] = _parallax(n, d, poses[i, : count[i]])
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

@@ -4,7 +4,7 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Protocol
 
 import rclpy
@@ -53,11 +53,11 @@ class Diagnostics:
         self._drops: Counter[str] = Counter()
         self._then, self._cpu_then = time.monotonic(), 0.0
 
-    def processed(self, estimator: Estimator, estimate: Estimate | None, publish_s: float) -> None:
-        """The worker is done with a frame."""
+    def processed(self, estimator: Estimator, estimate: Estimate | None, seconds: Mapping[str, float]) -> None:
+        """The worker is done with a frame; seconds: what is timed outside the estimator."""
         self._status, self.waiting_for, self._resets = estimator.status, estimator.waiting_for, estimator.resets
         self._rig = estimator.rig()
-        self._latency.add({**estimator.timings, 'publish': publish_s})
+        self._latency.add({**estimator.timings, **seconds})
         self._poses += estimate is not None
 
     def remember(self, note: str) -> None:
@@ -73,6 +73,7 @@ class Diagnostics:
         values = {name: f'{stream.measure(seconds):.1f} Hz' for name, stream in self._inputs.streams.items()}
         warnings = list(self._warnings(now))
         values |= {'frames processed': f'{latency.frames / seconds:.1f} Hz', 'poses': f'{poses / seconds:.1f} Hz',
+                   'frames waiting': str(self._inputs.inbox.ready),
                    'resets': str(self._resets), 'executor CPU': f'{100 * (cpu - self._cpu_then) / seconds:.0f} %',
                    **refinement(self._rig), **latency.summary(),
                    **{f'dropped: {reason}': str(n) for reason, n in self._drops.items()}}

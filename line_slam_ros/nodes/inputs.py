@@ -61,7 +61,7 @@ class Inputs:
             self._listen('pose', 'pose', PoseStamped, 'poses', self._on_pose)
             self._listen('odometry', 'odometry', Odometry, 'poses', self._on_pose)
         else:
-            self._listen('imu', 'imu', Imu, 'IMU data', self._on_imu)
+            self._listen('imu', 'imu', Imu, 'IMU data', self._on_imu, polled=True)
 
     def close(self) -> None:
         """No more messages; frames that are ready can still be taken."""
@@ -76,7 +76,9 @@ class Inputs:
             quiet = {name: s for name, s in quiet.items() if name not in ('pose', 'odometry')}
         return [s.silence(self._node.count_publishers(s.topic)) for s in quiet.values()]
 
-    def _listen(self, name: str, topic: str, kind: type, what: str, callback: Callable[[Any], None]) -> None:
+    def _listen(self, name: str, topic: str, kind: type, what: str, callback: Callable[[Any], None],
+                polled: bool = False) -> None:
+        """A polled topic's messages are handed over serialised, past the executor."""
         reliability = ReliabilityPolicy[self._shell.node.reliability.upper()]
         qos = QoSProfile(depth=DEPTHS.get(name, 100), reliability=reliability)
         stream = Stream(what, self._node.resolve_topic_name(topic), name, last=time.monotonic())
@@ -86,13 +88,12 @@ class Inputs:
             try:
                 callback(msg)
             except ValueError as error:
-                self.inbox.reject(f'{name} not usable', str(error), sensors.stamp_ns(msg))
+                self.inbox.reject(f'{name} not usable', str(error), 0 if polled else sensors.stamp_ns(msg))
 
-        group = Polled() if name == 'imu' else None
-        subscription = self._node.create_subscription(kind, topic, arrived, qos, callback_group=group,
-                                                      event_callbacks=NO_EVENTS)
-        if name == 'imu':
-            self._poller = Poller(subscription)
+        subscription = self._node.create_subscription(kind, topic, arrived, qos, event_callbacks=NO_EVENTS, raw=polled,
+                                                      callback_group=Polled() if polled else None)
+        if polled:
+            self._poller = Poller.of_messages(subscription)
         self.streams[name] = stream
 
     def _on_image(self, msg: Image) -> None:
@@ -109,8 +110,8 @@ class Inputs:
             self.inbox.drops['image before calibration'] += 1
         self._early.append(frame)
 
-    def _on_imu(self, msg: Imu) -> None:
-        self.inbox.imu(*sensors.imu_fields(msg))
+    def _on_imu(self, msg: bytes) -> None:
+        self.inbox.imu(*sensors.imu_of_cdr(msg))
 
     def _on_pose(self, msg: PoseStamped | Odometry) -> None:
         self.inbox.pose(*sensors.pose_from_msg(msg))

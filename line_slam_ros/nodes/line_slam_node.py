@@ -1,9 +1,11 @@
 """The live node: sensor topics in, poses and the line map out. Wiring only, no mathematics.
 
-One executor thread converts and enqueues; one worker thread computes and publishes.
+One executor thread converts, enqueues and sends the map; one worker thread computes and publishes everything else;
+one more saves the map, which takes seconds.
 """
 from __future__ import annotations
 
+import gc
 import sys
 import threading
 import time
@@ -26,13 +28,15 @@ from line_slam_ros.mapping.io import write_csv, write_ply
 from line_slam_ros.nodes.diagnostics import Diagnostics
 from line_slam_ros.nodes.inputs import Inputs
 from line_slam_ros.nodes.parameters import declare
+from line_slam_ros.nodes.polling import Polled, Poller
 from line_slam_ros.nodes.publishers import Publishers
 from line_slam_ros.ros_conventions import gyro_variance
 from line_slam_ros.slam import Slam
-from line_slam_ros.types import Calibration, Estimate, ImuBatch
+from line_slam_ros.types import Calibration, Estimate, ImuBatch, LineSegments
 
 RCLError = rclpy_implementation.RCLError
 SWITCH_INTERVAL_S = 5e-4  # how long the worker may keep the executor waiting; Python's 5 ms cost IMU latency
+SAVING_PAUSE_S = 4e-3  # between rows of a map that is saved, for the worker to go on
 WARM_UP_CALIBRATION = Calibration('radtan', 752, 480, (450.0, 450.0, 376.0, 240.0), (0.0, 0.0, 0.0, 0.0), np.eye(4))
 
 
@@ -54,7 +58,8 @@ class LineSlamNode(Node):
         self._incoming = Inputs(self, self._shell, self._calibrations.put)
         self._diagnostics = Diagnostics(self, self._incoming, self._shell)
         self.create_service(Trigger, '~/reset', self._on_reset)
-        self.create_service(Trigger, '~/save_map', self._on_save_map)
+        self._saving = Poller.of_requests(self.create_service(Trigger, '~/save_map', self._on_save_map,
+                                                              callback_group=Polled()))
         self.create_timer(1.0, self._every_second, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._worker = threading.Thread(target=self._work, name='worker', daemon=True)
 
@@ -71,6 +76,7 @@ class LineSlamNode(Node):
         self._stopping = True
         self._calibrations.put(None)
         self._incoming.close()
+        self._saving.stop()
         if self._worker.is_alive():
             self._worker.join(timeout=5.0)  # compiling cannot be interrupted; the thread is a daemon
 
@@ -95,6 +101,7 @@ class LineSlamNode(Node):
         self.get_logger().info('loading compiled code; the very first start compiles it, which takes a minute or so')
         began = time.monotonic()
         self._new_slam(WARM_UP_CALIBRATION).warm_up()
+        gc.freeze()  # what start-up made stays: collecting garbage takes 80 ms less
         self.get_logger().info(f'ready for data after {time.monotonic() - began:.1f} s')
         self._diagnostics.waiting_for = 'calibration'
 
@@ -109,6 +116,7 @@ class LineSlamNode(Node):
         for frame, companion in self._incoming.inbox:
             if self._stopping:
                 return
+            taken = time.perf_counter()
             noise = gyro_variance(calibration.imu_noise, companion) if isinstance(companion, ImuBatch) else 0.0
             with self._in_use:
                 if self._incoming.inbox.jumped:
@@ -118,25 +126,31 @@ class LineSlamNode(Node):
                 except ValueError as error:
                     self._incoming.inbox.reject('image not usable', str(error), frame.t_ns)
                 else:
-                    self._publish(slam, frame.t_ns, estimate, noise)
+                    self._publish(slam, frame.t_ns, estimate, noise, taken)
 
-    def _publish(self, slam: Slam | LineMapper, t_ns: int, estimate: Estimate | None, gyro_noise: float) -> None:
+    def _publish(self, slam: Slam | LineMapper, t_ns: int, estimate: Estimate | None, gyro_noise: float,
+                 taken: float) -> None:
+        """What a frame, taken from the inbox at a time of perf_counter(), gave."""
         began = time.perf_counter()
         self._newest_ns = t_ns
         if estimate is not None:
             self._outgoing.estimate(estimate, gyro_noise)
+        age = self._incoming.inbox.waited + time.perf_counter() - taken
         if self._outgoing.map_due(t_ns):
             self._publish_map(slam)
         if self._outgoing.image_wanted(t_ns):
             self._outgoing.image(t_ns, slam.front_end.draw())
-        self._diagnostics.processed(slam, estimate, time.perf_counter() - began)
+        self._diagnostics.processed(slam, estimate, {'publish': time.perf_counter() - began, 'since arrival': age})
 
     def _publish_map(self, slam: Slam | LineMapper) -> None:
         if slam.line_map.version != self._map_version:
             self._map_version = slam.line_map.version
-            self._outgoing.lines(self._newest_ns, slam.line_map.segments(), slam.active_lines())
+            self._send_lines(slam.line_map.segments(), slam.active_lines())
         if self._outgoing.points_wanted:
             self._outgoing.points(self._newest_ns, slam.points())
+
+    def _send_lines(self, whole: LineSegments, active: LineSegments) -> None:
+        self.executor.create_task(self._outgoing.lines, self._newest_ns, whole, active)
 
     def _reset(self, reason: str) -> None:
         """Start estimate and map again; call it with ``_in_use`` held."""
@@ -145,7 +159,8 @@ class LineSlamNode(Node):
             self._slam.reset(reason)
             self._slam.line_map.clear()
             self._map_version = self._slam.line_map.version
-            self._outgoing.reset(self._newest_ns)
+            self._outgoing.reset()
+            self._send_lines(LineSegments.empty(), LineSegments.empty())
 
     def _every_second(self) -> None:
         for note in self._incoming.inbox.notes():
@@ -187,7 +202,7 @@ class LineSlamNode(Node):
             segments = self._slam.line_map.segments()
         ply, csv = Path(f'{path}.ply'), Path(f'{path}.csv')
         write_ply(ply, segments)
-        write_csv(csv, segments)
+        write_csv(csv, segments, SAVING_PAUSE_S)
         return f'{len(segments)} lines written to {ply} and {csv}'
 
 

@@ -13,7 +13,8 @@ from line_slam_ros.shell_config import ShellConfig
 from line_slam_ros.types import F64, U8, Estimate, LineSegments
 from msg_adapters import outputs
 from msg_adapters.factories import ros_messages
-from msg_adapters.marker_bytes import LineListBytes
+from msg_adapters.marker_bytes import LineMarkers
+from msg_adapters.path_bytes import PathBytes
 
 PATH_POSES = 500  # a path never grows beyond; with more, every second pose is forgotten
 PATH_STEP_NS = 100_000_000
@@ -24,7 +25,7 @@ NO_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)
 class Publishers:
     """``~/odometry``, ``~/pose``, ``~/path``, ``~/lines``, ``~/points``, ``~/image_lines`` and ``/tf``.
 
-    Called by the worker thread; only the late joiner of ``~/lines`` is served from the executor's.
+    Called by the worker thread, but for lines(): a large map takes milliseconds to send, which is for the executor's.
     """
 
     def __init__(self, node: Node, shell: ShellConfig) -> None:
@@ -41,9 +42,9 @@ class Publishers:
         self._lines = node.create_publisher(self._new.type('visualization_msgs/msg/Marker'), '~/lines', latched,
                                             event_callbacks=PublisherEventCallbacks(
                                                 matched=self._on_lines_matched, use_default_callbacks=False))
-        self._map_bytes = self._line_list('map', outputs.MAP_COLOUR)
-        self._active_bytes = self._line_list('active', outputs.ACTIVE_COLOUR)
+        self._markers = LineMarkers(self._new, serialize_message, shell.odom_frame, shell.node.line_width)
         self._newest_lines: tuple[bytes, bytes] | None = None
+        self._path_of = PathBytes(shell.odom_frame)
         self._tf = self._advertise_tf()
         self.map_due = Rate(shell.node.map_rate)
         self._path_due = Rate(shell.node.path_rate)
@@ -60,14 +61,13 @@ class Publishers:
         if heard(self._pose):
             self._pose.publish(outputs.pose(self._new, estimate, odom))
         if self._path.due(estimate.t_ns):
-            self._path.add(estimate.t_ns, outputs.pose_stamped(self._new, estimate.t_ns, estimate.T_WB, odom))
+            self._path.add(estimate.t_ns, self._path_of.pose(estimate.t_ns, estimate.T_WB))
         if heard(self._trajectory) and self._path_due(estimate.t_ns):
-            self._trajectory.publish(outputs.path_of(self._new, self._path.poses, estimate.t_ns, odom))
+            self._trajectory.publish(self._path_of(estimate.t_ns, self._path.poses))
 
     def lines(self, t_ns: int, whole: LineSegments, active: LineSegments) -> None:
         """Two markers: the whole map, and on top of it, thicker, the lines of the window. Kept for late joiners."""
-        self._newest_lines = (self._map_bytes(t_ns, whole.ends.reshape(-1, 3)),
-                              self._active_bytes(t_ns, active.ends.reshape(-1, 3)))
+        self._newest_lines = self._markers(t_ns, whole.ends, active.ends)
         if heard(self._lines):
             self._publish_lines()
 
@@ -87,12 +87,11 @@ class Publishers:
         """Debug image (H, W, 3); its frame is the camera's, which messages do not need to name."""
         self._image.publish(outputs.image(self._new, bgr, t_ns, ''))
 
-    def reset(self, t_ns: int) -> None:
-        """Forgets the path and shows an empty map."""
+    def reset(self) -> None:
+        """Forgets the path."""
         self._path = DecimatedPath()
         for due in (self.map_due, self._path_due, self._image_due):
             due.reset()
-        self.lines(t_ns, LineSegments.empty(), LineSegments.empty())
 
     def _publish_lines(self) -> None:
         for marker in self._newest_lines or ():
@@ -112,12 +111,6 @@ class Publishers:
         except ImportError:
             self._node.get_logger().warning('tf2_msgs is not installed: /tf is not published, the rest is')
             return None
-
-    def _line_list(self, namespace: str, colour: outputs.Colour) -> LineListBytes:
-        width = self._shell.node.line_width * (1.5 if namespace == 'active' else 1.0)
-        marker = outputs.lines_marker(self._new, LineSegments.empty().ends, 0, self._shell.odom_frame, namespace,
-                                      colour, width)
-        return LineListBytes(marker, self._new('geometry_msgs/msg/Point'), serialize_message)
 
 
 class Rate:
@@ -139,10 +132,10 @@ class Rate:
 
 
 class DecimatedPath:
-    """Poses (messages) of the whole way in bounded memory: when full, every second one goes and the step doubles."""
+    """Poses (serialised) of the whole way in bounded memory: when full, every second one goes and the step doubles."""
 
     def __init__(self) -> None:
-        self.poses: list[Any] = []
+        self.poses: list[bytes] = []
         self._step_ns = PATH_STEP_NS
         self._next = -2**63
 
@@ -150,7 +143,7 @@ class DecimatedPath:
         """Whether the next pose is far enough from the last."""
         return t_ns >= self._next
 
-    def add(self, t_ns: int, pose: Any) -> None:
+    def add(self, t_ns: int, pose: bytes) -> None:
         """Appends a pose and thins the path when it is full."""
         self.poses.append(pose)
         if len(self.poses) >= PATH_POSES:
