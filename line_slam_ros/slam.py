@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -28,7 +28,7 @@ from line_slam_ros.types import (
     Samples,
     Status,
 )
-from line_slam_ros.warm_up import warm_up_estimator, warm_up_front_end
+from line_slam_ros.warm_up import warm_up
 
 MAX_IMU_GAP_S = 0.2  # longer, and the motion in between is anyone's guess
 
@@ -51,11 +51,12 @@ class Slam:
         self._last_ns: int | None = None
         self._mapped = np.empty(0, np.int64)
 
-    def warm_up(self) -> None:
-        """Compile every kernel, or load it from the cache, on throwaway copies fed with simulated data."""
-        warm_up_front_end(FrontEnd(self.camera, self.config), self.calibration)
-        warm_up_estimator(self.config.estimator)
-        LineMap.warm_up(self.config.mapping)
+    def warm_up(self, tell: Callable[[str], None] = print) -> None:
+        """Compile every kernel, or load it from the cache, on throwaway copies fed with simulated data.
+
+        tell is called with a sentence for the human when it takes long.
+        """
+        warm_up(FrontEnd(self.camera, self.config), self.calibration, self.config, tell)
 
     def process(self, frame: Frame, imu: ImuBatch) -> Estimate | None:
         """One frame and the inertial samples since the previous one; None until initialised and while lost.

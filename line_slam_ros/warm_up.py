@@ -1,16 +1,40 @@
 """Runs every compiled kernel once, so that the first real frame does not wait for a compiler."""
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 
+from line_slam_ros.config import Config
 from line_slam_ros.config import Estimator as EstimatorOptions
 from line_slam_ros.estimation.bootstrap import Bootstrap
 from line_slam_ros.estimation.estimator import Estimator
 from line_slam_ros.frontend.front_end import FrontEnd
 from line_slam_ros.geometry.imu import between
+from line_slam_ros.geometry.lie import quaternion_from_matrix
+from line_slam_ros.kernel_cache import cache_is_empty
+from line_slam_ros.mapping.line_map import LineMap
 from line_slam_ros.simulation.features import Room, Sequence, Trajectory, calibration
 from line_slam_ros.types import Calibration, Frame
+
+BESIDE = 'import sys; sys.path[:] = {path!r}; import line_slam_ros.warm_up as w; w.warm_up_estimator(w.EstimatorOptions())'
+
+
+def warm_up(front_end: FrontEnd, calibration: Calibration, config: Config, tell: Callable[[str], None]) -> None:
+    """Everything. With nothing in the cache this is told, and another process compiles the estimator meanwhile."""
+    beside = None
+    if cache_is_empty(tell) and (os.cpu_count() or 1) > 1:
+        beside = subprocess.Popen([sys.executable, '-c', BESIDE.format(path=sys.path)])
+    LineMap.warm_up(config.mapping)
+    quaternion_from_matrix(np.eye(3))
+    warm_up_front_end(front_end, calibration)
+    if beside is not None:
+        beside.wait()  # what it could not compile is compiled here, and its error comes up again
+    warm_up_estimator(config.estimator)
 
 
 def warm_up_estimator(options: EstimatorOptions) -> None:

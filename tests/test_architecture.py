@@ -14,7 +14,7 @@ SOURCES = sorted(PACKAGE.rglob('*.py'))
 
 # Who may import whom: a room's modules import from their own layer and the layers before it.
 LAYERS = (
-    ('types', 'config', 'geometry'),
+    ('types', 'config', 'kernel_cache', 'geometry'),
     ('factors',),
     ('frontend', 'estimation', 'mapping', 'simulation'),
     ('slam', 'warm_up', 'inbox', 'imu_buffer', 'pose_buffer', 'notes', 'calibration', 'shell_config', 'config_file',

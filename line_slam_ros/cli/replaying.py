@@ -49,7 +49,7 @@ def replay(args: argparse.Namespace) -> int:
         stream = DegradedStream(wanted, calibration.imu_noise)
         calibration = degraded_calibration(calibration, wanted)
         run = (PoseRun if shell.pose_source == 'topic' else ImuRun)(config, shell, calibration, topics, stream)
-        run.slam.warm_up()
+        run.slam.warm_up(_tell)
         record = settings_of(config, shell) | {f'degrade.{name}': v for name, v in wanted.changes().items()}
         with Results(args.output, shell, record, run.slam, run.inbox, args.figure) as results:
             _run_through(bag, Clip(topics.image, args.start, args.duration), topics, run, results)

@@ -1,7 +1,7 @@
 """Mapping with given poses: only the lines are estimated. The second mode, next to Slam."""
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from time import perf_counter
@@ -15,6 +15,7 @@ from line_slam_ros.frontend.front_end import FrontEnd
 from line_slam_ros.geometry.camera import Camera
 from line_slam_ros.geometry.lie import rigid
 from line_slam_ros.geometry.line_forms import VALUES, store_lines
+from line_slam_ros.kernel_cache import cache_is_empty
 from line_slam_ros.mapping.line_map import LineMap
 from line_slam_ros.mapping.table import IdTable
 from line_slam_ros.mapping.views import add_view, view_columns
@@ -50,8 +51,9 @@ class LineMapper:
         self._last: tuple[int, F64] | None = None  # t_ns, T_WC
         self._keyframe: tuple[LineObservations, F64] | None = None  # with R_WC
 
-    def warm_up(self) -> None:
-        """Compile or load every kernel."""
+    def warm_up(self, tell: Callable[[str], None] = print) -> None:
+        """Compile or load every kernel; tell is called with a sentence for the human when it takes long."""
+        cache_is_empty(tell)
         LineMap.warm_up(self._config.mapping)
         LineEstimator.warm_up(self._config)
         scratch = FrontEnd(Camera(self._calibration), replace(self._config, use_points=False, use_lines=True))

@@ -98,9 +98,9 @@ class LineSlamNode(Node):
 
     def _warm_up(self) -> None:
         self._diagnostics.waiting_for = 'loading compiled code'
-        self.get_logger().info('loading compiled code; the very first start compiles it, which takes a minute or so')
+        self.get_logger().info('loading compiled code')
         began = time.monotonic()
-        self._new_slam(WARM_UP_CALIBRATION).warm_up()
+        self._new_slam(WARM_UP_CALIBRATION).warm_up(self.get_logger().info)
         gc.freeze()  # what start-up made stays: collecting garbage takes 80 ms less
         self.get_logger().info(f'ready for data after {time.monotonic() - began:.1f} s')
         self._diagnostics.waiting_for = 'calibration'
