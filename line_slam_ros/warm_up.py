@@ -21,7 +21,10 @@ from line_slam_ros.mapping.line_map import LineMap
 from line_slam_ros.simulation.features import Room, Sequence, Trajectory, calibration
 from line_slam_ros.types import Calibration, Frame
 
-BESIDE = 'import sys; sys.path[:] = {path!r}; import line_slam_ros.warm_up as w; w.warm_up_estimator(w.EstimatorOptions())'
+BESIDE = """import sys
+sys.path[:] = {path!r}
+from line_slam_ros import warm_up
+warm_up.warm_up_estimator(warm_up.EstimatorOptions())"""
 
 
 def warm_up(front_end: FrontEnd, calibration: Calibration, config: Config, tell: Callable[[str], None]) -> None:
