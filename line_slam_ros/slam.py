@@ -58,9 +58,10 @@ class Slam:
         """
         warm_up(FrontEnd(self.camera, self.config), self.calibration, self.config, tell)
 
-    def process(self, frame: Frame, imu: ImuBatch) -> Estimate | None:
+    def process(self, frame: Frame, imu: ImuBatch, behind: bool = False) -> Estimate | None:
         """One frame and the inertial samples since the previous one; None until initialised and while lost.
 
+        When the caller is behind, nothing new is detected in this frame, which saves time.
         Raises ValueError for a frame that is not newer than the last, that no inertial sample
         accompanies, or whose size is not the camera's.
         """
@@ -68,7 +69,7 @@ class Slam:
         with self._timed('total'):
             samples = None if self._last_ns is None else between(imu, self._last_ns, frame.t_ns)
             with self._timed('track'):
-                observations = self.front_end.track(frame, self._camera_rotation(samples))
+                observations = self.front_end.track(frame, self._camera_rotation(samples), skip_detection=behind)
             previous_ns, self._last_ns = self._last_ns, frame.t_ns
             still = self._stillness.add(observations, samples)
             if samples is not None and (gap := longest_gap(imu, previous_ns, frame.t_ns)) > MAX_IMU_GAP_S:

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -7,7 +8,7 @@ import pytest
 import yaml
 from plane_scene import homography, mosaic, pinhole, view
 
-from line_slam_ros.config import Config, Points
+from line_slam_ros.config import Config, Lines, Points
 from line_slam_ros.frontend.front_end import FrontEnd
 from line_slam_ros.geometry.camera import Camera
 from line_slam_ros.geometry.lie import matrix_from_quaternion
@@ -108,6 +109,32 @@ def test_drawing_and_timings():
     assert canvas.shape == (240, 320, 3) and canvas.dtype == np.uint8
     assert np.any(canvas[..., 0] != canvas[..., 1])
     assert set(front_end.timings) == {'detect', 'track'}
+
+
+def test_detection_can_be_skipped_while_enough_is_tracked():
+    scene = mosaic()
+    images = [view(scene, homography([0.0, 0.001 * k, 0.003 * k], [0.01 * k, 0.0, 0.0])) for k in range(4)]
+    front_end = FrontEnd(pinhole(), replace(CONFIG, lines=Lines(max_count=20)))
+    first = front_end.track(Frame(0, images[0]), None, skip_detection=True)
+    assert len(first.points.ids) and len(first.lines.ids)  # there were none: that cannot wait
+    front_end.forget(first.points.ids[::4], first.lines.ids[::4])
+    skipped = front_end.track(Frame(1, images[1]), None, skip_detection=True)
+    assert len(skipped.points.ids) and np.isin(skipped.points.ids, first.points.ids).all()
+    assert len(skipped.lines.ids) and np.isin(skipped.lines.ids, first.lines.ids).all()
+    for k in (2, 3):
+        later = front_end.track(Frame(k, images[k]), None)
+    assert later.points.ids.max() > first.points.ids.max()
+
+
+def test_new_points_and_lines_come_with_different_images():
+    scene, front_end = mosaic(), FrontEnd(pinhole(), CONFIG)
+    seen = [front_end.track(Frame(0, view(scene, np.eye(3))), None)]
+    for k in range(1, 12):
+        front_end.forget(seen[-1].points.ids[:10], seen[-1].lines.ids[:1])
+        seen.append(front_end.track(Frame(k, view(scene, np.eye(3))), np.eye(3)))
+    points, lines = ([getattr(b, what).ids.max() > getattr(a, what).ids.max() for a, b in pairwise(seen)]
+                     for what in ('points', 'lines'))
+    assert sum(points) > 1 and sum(lines) > 1 and not np.any(np.logical_and(points, lines))
 
 
 def excerpt(folder, first, count):

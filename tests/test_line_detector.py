@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 
 from line_slam_ros.frontend.line_detector import detect
+from line_slam_ros.frontend.segment_kernels import buffers
 
 
 def drawn(*boxes, dark=60, bright=180):
@@ -16,7 +17,7 @@ def drawn(*boxes, dark=60, bright=180):
 def found_at_half_size(image, min_length_px):
     """Segments in px of image, found as the tracker does."""
     half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    return 2.0 * detect(half, 0.5 * min_length_px) + 0.5
+    return 2.0 * detect(half, 0.5 * min_length_px, buffers(*half.shape)) + 0.5
 
 
 def test_the_four_edges_of_a_box():
@@ -40,7 +41,7 @@ def test_an_edge_of_any_direction_is_found_where_it_is(angle):
     v, u = np.mgrid[:300, :400]
     t, normal = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
     distance = (u - 200.0) * normal[0] + (v - 150.0) * normal[1]
-    found = detect(np.rint(120.0 + 60.0 * np.tanh(0.9 * distance)).astype(np.uint8), 40.0)
+    found = detect(np.rint(120.0 + 60.0 * np.tanh(0.9 * distance)).astype(np.uint8), 40.0, buffers(300, 400))
     assert len(found) == 1
     ends = found[0] - [200.0, 150.0]
     assert np.abs(ends @ normal).max() < 0.3 and (ends[1] - ends[0]) @ t > 280.0  # px

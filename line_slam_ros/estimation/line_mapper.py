@@ -63,9 +63,10 @@ class LineMapper:
             image[height // 4: -height // 4, width // 4 + k: -width // 4 + k] = 180
             scratch.track(Frame(k, image), np.eye(3))
 
-    def process_with_pose(self, frame: Frame, T_WB: F64) -> Estimate:
+    def process_with_pose(self, frame: Frame, T_WB: F64, behind: bool = False) -> Estimate:
         """One frame and the body's pose (4, 4) when it was taken. The estimate repeats the pose.
 
+        When the caller is behind, nothing new is detected in this frame, which saves time.
         Raises ValueError for a frame that is not newer than the last and for a pose that is not finite.
         """
         if self._last is not None and frame.t_ns <= self._last[0]:
@@ -77,7 +78,7 @@ class LineMapper:
             T_WC = T_WB @ self._calibration.T_BC
             R_CnCp = None if self._last is None else T_WC[:3, :3].T @ self._last[1][:3, :3]
             with self._timed('track'):
-                seen = self.front_end.track(frame, R_CnCp).lines
+                seen = self.front_end.track(frame, R_CnCp, skip_detection=behind).lines
             self._last = frame.t_ns, T_WC
             self.status, self.waiting_for = Status.TRACKING, ''
             is_keyframe = self._is_keyframe(seen, T_WC[:3, :3])

@@ -37,26 +37,28 @@ class FrontEnd:
         self._points.forget(point_ids)
         self._lines.forget(line_ids)
 
-    def track(self, frame: Frame, R_CnCp: F64 | None) -> Observations:
+    def track(self, frame: Frame, R_CnCp: F64 | None, skip_detection: bool = False) -> Observations:
         """Follow points and lines into frame; R_CnCp (3, 3) turns rays of the previous camera into this one.
 
-        None: the rotation is unknown. Raises ValueError when the image is not of the calibrated size.
+        None: the rotation is unknown. New points and lines are looked for in different images, if that can wait; with
+        skip_detection, which saves time, only where few are left. Raises ValueError when the image is not of
+        the calibrated size.
         """
         if frame.image.shape != self._image.shape:
             (h, w), (rows, columns) = self._image.shape, frame.image.shape[:2]
             raise ValueError(f'image is {columns}x{rows} px, the calibration is for {w}x{h}: use the one that fits')
         self._image = frame.image.copy(order='C')  # it is needed again when the next one comes
-        times = [perf_counter()]
+        R_CnCp = None if R_CnCp is None else np.ascontiguousarray(R_CnCp, float)
+        times, pace = [perf_counter()], self._pace(frame.t_ns)
         if self._config.use_points:
-            self._points.track(self._image, R_CnCp)
+            self._points.track(self._image, R_CnCp, pace)
         if self._config.use_lines:
             self._lines.take(self._image)
-            self._lines.track(R_CnCp, self._points.x_turned, self._points.motion_x, self._pace(frame.t_ns))
+            self._lines.track(R_CnCp, self._points.x_turned, self._points.motion_x, pace)
         times.append(perf_counter())
+        looked = self._config.use_lines and self._lines.detect(skip_detection)
         if self._config.use_points:
-            self._points.detect()
-        if self._config.use_lines:
-            self._lines.detect()
+            self._points.detect(skip_detection or looked)
         times.append(perf_counter())
         self.timings = dict(zip(('track', 'detect'), np.diff(times).tolist(), strict=True))
         return Observations(frame.t_ns, self._points.observations(), self._lines.observations())

@@ -9,14 +9,18 @@ from numpy.typing import NDArray
 
 from line_slam_ros.config import Lines
 from line_slam_ros.frontend import edge_kernels as edge
+from line_slam_ros.frontend.edge_sampling import LENS_STEP, SAMPLES, neighbours
 from line_slam_ros.frontend.line_detector import detect
 from line_slam_ros.frontend.rows import Rows
+from line_slam_ros.frontend.segment_kernels import buffers
+from line_slam_ros.frontend.segment_sets import duplicates
 from line_slam_ros.geometry.camera import Camera
 from line_slam_ros.types import F64, I64, U8, LineObservations
 
 SIGMA_FLOOR_PX = 0.2  # what a fit to one image cannot know: blur, lens model, edges that are not sharp
 SAME_EDGE_PX = 3.0
 REFILL = 0.9  # of max_count: below, new segments are looked for
+FEW = 0.5  # of max_count: below, they cannot wait
 DETECT_EVERY = 5  # images, at most
 SAME_PROFILE = 0.6  # correlation with the profile in the previous image
 ON_EDGE, ON_EDGE_NEW = 0.5, 0.7  # share of the samples that must lie on the fitted line
@@ -33,13 +37,13 @@ class Segments(Rows):
     ends: F64  # (M, 2, 2) px of the undistorted canvas
     variance: F64  # (M, 2) px^2 of each end across the segment
     motion: F64  # (M, 2, 2) px, last displacement beyond that of the rotation
-    profiles: NDArray[np.float32]  # (M, SAMPLES, 2 HALF + 1) grey across the segment, normalised
+    slots: I64  # where the tracker keeps the grey profile
 
     @staticmethod
     def blank(n: int) -> Segments:
         """n rows, not filled in except ages and motion."""
         return Segments(np.empty(n, np.int64), np.zeros(n, np.int64), np.empty((n, 2, 2)), np.empty((n, 2)),
-                        np.zeros((n, 2, 2)), np.empty((n, edge.SAMPLES, 2 * edge.HALF + 1), np.float32))
+                        np.zeros((n, 2, 2)), np.empty(n, np.int64))
 
 
 class LineTracker:
@@ -53,21 +57,23 @@ class LineTracker:
     def __init__(self, camera: Camera, config: Lines):
         self._config = config
         self.canvas, self._half_canvas = camera.rectified(), camera.rectified(0.5)
-        self._lens = self._lens_table(camera)
+        self._work = buffers(*self._half_canvas.size[::-1])
+        self._image = np.zeros((camera.calibration.height, camera.calibration.width), np.uint8)  # smoothed
+        self._view = neighbours(self._image), self._image.shape, self._lens_table(camera)  # what the kernels look at
+        self._profiles = np.empty((config.max_count, edge.WIDTH, SAMPLES), np.float32)
         self._next_id = 0
         self.reset()
 
-    def _lens_table(self, camera: Camera) -> F64:
+    def _lens_table(self, camera: Camera) -> NDArray[np.float32]:
         """Received pixel (H / LENS_STEP, W / LENS_STEP, 2) of the undistorted ones; NaN where there is none."""
         width, height = self.canvas.size
-        v, u = np.mgrid[:height + edge.LENS_STEP:edge.LENS_STEP, :width + edge.LENS_STEP:edge.LENS_STEP]
+        v, u = np.mgrid[:height + LENS_STEP:LENS_STEP, :width + LENS_STEP:LENS_STEP]
         uv = camera.project(self.canvas.normalise(np.stack([u, v], axis=-1).reshape(-1, 2)))
-        return np.ascontiguousarray(uv.reshape(*u.shape, 2))
+        return uv.reshape(*u.shape, 2).astype(np.float32)
 
     def reset(self) -> None:
         """Forget every track; ids go on counting."""
         self.segments = Segments.blank(0)
-        self._image: U8 | None = None
         self._wait = 0
 
     def forget(self, ids: I64) -> None:
@@ -82,7 +88,7 @@ class LineTracker:
 
     def take(self, image: U8) -> None:
         """Take the newest image (H, W), as received."""
-        self._image = cv2.GaussianBlur(image, (3, 3), 0)
+        cv2.GaussianBlur(image, (3, 3), 0, dst=self._image)
 
     def track(self, R_CnCp: F64 | None, x: F64, motion_x: F64, pace: float = 1.0) -> None:
         """Move every track into the newest image.
@@ -94,37 +100,31 @@ class LineTracker:
         if not len(segments):
             return
         turned = self._turn(R_CnCp)
+        segments.motion *= pace
         new = segments.ages == 0
-        segments.motion[new] = self._flow(turned[new], x, motion_x)
-        segments.motion[~new] *= pace
+        if new.any():
+            segments.motion[new] = self._flow(turned[new], x, motion_x)
         segments.ends = turned + segments.motion
-        score = np.empty(len(segments))
-        edge.follow(self._image, self._lens, segments.profiles, segments.ends, score)
-        segments.motion = segments.ends - turned
-        segments.ages = segments.ages + 1
-        good = self._measure(segments, ON_EDGE, HYSTERESIS * self._config.min_length_px) & (score > SAME_PROFILE)
-        self.segments = self._apart(segments.select(good), len(segments))
-        edge.remember(self._image, self._lens, self.segments.ends, self.segments.profiles)
-
-    def _measure(self, segments: Segments, on_edge: float, shortest: float) -> NDArray[np.bool_]:
-        """Put the segments on their edges, in place; mask (M,) of those that are there and long enough."""
-        support = np.empty(len(segments))
-        edge.measure(self._image, self._lens, self._config.min_contrast, segments.ends, segments.variance, support)
-        length = np.linalg.norm(segments.ends[:, 1] - segments.ends[:, 0], axis=1)
-        return (support > on_edge) & (length > shortest)
+        good = np.empty(len(segments), np.bool_)
+        edge.follow(self._view, self._config.min_contrast, SAME_PROFILE, ON_EDGE,
+                    HYSTERESIS * self._config.min_length_px, segments.slots, self._profiles, segments.ends,
+                    segments.motion, segments.variance, good)
+        segments.ages += 1
+        self.segments = self._apart(segments if good.all() else segments.select(good), len(segments))
 
     def _apart(self, segments: Segments, of: int) -> Segments:
         """Without those that lie on an earlier one of the first so many; rows are in order of their age."""
-        doubled = np.zeros(len(segments), np.bool_)
-        edge.duplicates(segments.ends, SAME_EDGE_PX, of, doubled)
-        return segments.select(~doubled)
+        doubled = np.empty(len(segments), np.bool_)
+        duplicates(segments.ends, SAME_EDGE_PX, of, doubled)
+        return segments.select(~doubled) if doubled.any() else segments
 
     def _turn(self, R_CnCp: F64 | None) -> F64:
         """Ends (M, 2, 2) px where they would be, had the camera only turned."""
         if R_CnCp is None:
             return self.segments.ends.copy()
-        rays = self.canvas.normalise(self.segments.ends) @ R_CnCp[:, :2].T + R_CnCp[:, 2]
-        return self.canvas.project(rays[..., :2] / np.maximum(rays[..., 2:], 0.1))
+        c, turned = self.canvas, np.empty_like(self.segments.ends)
+        edge.turn(R_CnCp, (c.fx, c.fy), (c.cx, c.cy), self.segments.ends, turned)
+        return turned
 
     def _flow(self, ends: F64, x: F64, motion_x: F64) -> F64:
         """Mean motion (M, 2, 2) px of the corners around each segment's middle, by Gaussian weights; 0 far from any."""
@@ -134,23 +134,28 @@ class LineTracker:
         mean = (weight @ motion) / (weight.sum(axis=1, keepdims=True) + 0.1)
         return np.repeat(mean[:, None], 2, axis=1)
 
-    def detect(self) -> None:
-        """New segments, every few images, while there is room."""
+    def detect(self, wait: bool = False) -> bool:
+        """New segments, every few images, while there is room; did it look? wait: only when there are FEW."""
         self._wait -= 1
-        room = self._config.max_count - len(self.segments)
-        if self._wait > 0 or len(self.segments) > REFILL * self._config.max_count or room == 0:
-            return
+        room, count = self._config.max_count - len(self.segments), len(self.segments)
+        if self._wait > 0 or room == 0 or count > (FEW if wait else REFILL) * self._config.max_count:
+            return False
         self._wait = DETECT_EVERY
         half = cv2.remap(self._image, self._half_canvas.map1, self._half_canvas.map2, cv2.INTER_LINEAR)
-        ends = 2.0 * detect(half, 0.5 * self._config.min_length_px)
+        ends = 2.0 * detect(half, 0.5 * self._config.min_length_px, self._work)
         fresh = Segments.blank(len(ends))
         fresh.ends = ends
         old = len(self.segments)
         fresh = self._apart(self.segments.extended(fresh), old).select(slice(old, None))
-        fresh = fresh.select(self._measure(fresh, ON_EDGE_NEW, self._config.min_length_px))
+        good = np.empty(len(fresh), np.bool_)
+        edge.settle(self._view, self._config.min_contrast, ON_EDGE_NEW, self._config.min_length_px, room,
+                    fresh.ends, fresh.variance, good)
+        fresh = fresh.select(good)
         both = self._apart(self.segments.extended(fresh), old + len(fresh))
         fresh = both.select(slice(old, self._config.max_count))
         fresh.ids = np.arange(self._next_id, self._next_id + len(fresh))
+        fresh.slots = np.setdiff1d(np.arange(self._config.max_count), self.segments.slots)[:len(fresh)]
         self._next_id += len(fresh)
-        edge.remember(self._image, self._lens, fresh.ends, fresh.profiles)
+        edge.learn(self._view, fresh.ends, fresh.slots, self._profiles)
         self.segments = self.segments.extended(fresh)
+        return True

@@ -9,8 +9,7 @@ and the template's own gradient gives the Jacobian, so that the normal matrix is
 the Jacobian images are made orthogonal to T and to 1, and their products with T vanish, so that the right-hand side is
 their product with the image itself.
 
-A template is kept with a ring for its gradient, (SIZE + 2, LANES + 2). Rows of work space are LANES wide, one more than
-SIZE, which processors like; the last column is 0.
+Rows of work space are LANES wide, one more than SIZE, which processors like; the last column is 0.
 """
 from __future__ import annotations
 
@@ -21,7 +20,8 @@ RADIUS = 7  # px
 SIZE = 2 * RADIUS + 1
 LANES = 16
 STRAIGHT = 0.02  # largest entry of a map minus identity for which a patch is cut along rows: 0.14 px at its rim
-STIFFNESS = 50.0  # a weak belief that the shape does not change
+SLIDES = 10  # iterations at most
+SETTLED = 4e-4  # px^2, step after which there is no other
 ONE = np.float32(1.0)
 HALF = np.float32(0.5)
 AREA = SIZE * LANES
@@ -94,53 +94,51 @@ def gradient(patch, J):
 
 
 @njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
-def steepest(patch, J, along):
-    """Fill J (1 + P, AREA) of a patch: its grey without mean, then the images of P parameters.
+def prepare(patch, J, sums):
+    """Fill J (3, AREA) with the grey of a patch, less that of its middle, and its derivatives; 0 in the last column.
 
-    P = 2: u, v; P = 6: and the affine uu, uv, vu, vv (per RADIUS); all made orthogonal to the grey and to 1.
-    along (1 + P,): products with the grey before that. Returns the patch's mean.
+    sums (9,): of grey, by u, by v, and of the products of these with the grey, by u, by v: gg, gu, gv, uu, uv, vv.
     """
-    gradient(patch, J)
-    for p in range(3, len(J)):
-        image, by, weight = J[p], J[1 + (p - 3) // 2], RIGHT if p % 2 else DOWN
-        for k in range(AREA):
-            image[k] = by[k] * weight[k]
-    base, grey = dot(J[0], INSIDE) / np.float32(SIZE * SIZE), J[0]
-    for k in range(AREA):
-        grey[k] = (grey[k] - base) * INSIDE[k]
-    along[0] = dot(grey, grey) + 1e-3
-    for p in range(1, len(J)):
-        image = J[p]
-        mean = dot(image, INSIDE) / np.float32(SIZE * SIZE)
-        along[p] = dot(grey, image)
-        share = np.float32(along[p] / along[0])
-        for k in range(AREA):
-            image[k] = (image[k] - mean - share * grey[k]) * INSIDE[k]
-    return base
+    middle, zero = patch[RADIUS + 1, RADIUS + 1], np.float32(0.0)
+    g = u = v = gg = gu = gv = uu = uv = vv = zero
+    for y in range(SIZE):
+        up, row, low = patch[y], patch[y + 1], patch[y + 2]
+        grey, by_u, by_v = J[0, y * LANES:], J[1, y * LANES:], J[2, y * LANES:]
+        for x in range(LANES):
+            a = (row[x + 1] - middle) * INSIDE[x]
+            b, c = HALF * (row[x + 2] - row[x]) * INSIDE[x], HALF * (low[x + 1] - up[x + 1]) * INSIDE[x]
+            grey[x], by_u[x], by_v[x] = a, b, c
+            g += a
+            u += b
+            v += c
+            gg += a * a
+            gu += a * b
+            gv += a * c
+            uu += b * b
+            uv += b * c
+            vv += c * c
+    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7], sums[8] = g, u, v, gg, gu, gv, uu, uv, vv
 
 
 @njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
-def products(image, u, v, J):
-    """(inside, products of J (3, AREA) with the grey around (u, v))."""
-    h, w = image.shape
-    c, r = int(np.floor(u)) - RADIUS, int(np.floor(v)) - RADIUS
-    s0 = s1 = s2 = np.float32(0.0)
-    if not (c >= 1 and r >= 1 and c + LANES + 1 < w and r + LANES + 1 < h):
-        return False, s0, s1, s2
-    a, b = np.float32(u - np.floor(u)), np.float32(v - np.floor(v))
+def products(image, c, r, a, b, base, J):
+    """Products of J (3, AREA) with the grey, less base, around (c + a, r + b), and the sum of that grey."""
+    s0 = s1 = s2 = total = np.float32(0.0)
+    left, above = ONE - a, ONE - b
     for y in range(SIZE):
-        top, low = image[r + y, c:c + LANES + 1], image[r + y + 1, c:c + LANES + 1]
+        top, low = image[r - RADIUS + y, c - RADIUS:], image[r - RADIUS + y + 1, c - RADIUS:]
         j0, j1, j2 = J[0, y * LANES:], J[1, y * LANES:], J[2, y * LANES:]
         for x in range(LANES):
-            grey = (ONE - b) * ((ONE - a) * top[x] + a * top[x + 1]) + b * ((ONE - a) * low[x] + a * low[x + 1])
+            grey = above * (left * top[x] + a * top[x + 1]) + b * (left * low[x] + a * low[x + 1]) - base
             s0 += j0[x] * grey
             s1 += j1[x] * grey
             s2 += j2[x] * grey
-    return True, s0, s1, s2
+            total += grey * INSIDE[x]
+    return s0, s1, s2, total
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def slide(previous, current, u0, v0, M, u, v, steps, patch, J):
+def slide(previous, current, u0, v0, M, u, v, patch, J):
     """Translate (u, v) in current until it shows what previous shows at (u0, v0) + M (x, y).
 
     patch (SIZE + 2, LANES + 2), J (3, AREA): work space. Returns (ok, u, v).
@@ -149,121 +147,44 @@ def slide(previous, current, u0, v0, M, u, v, steps, patch, J):
     if not (warp(previous, u0, v0, M, RADIUS + 1, np.float32(0.0), patch) if turned else
             cut(previous, u0, v0, patch)):
         return False, u, v
-    along = np.empty(3)
-    steepest(patch, J, along)
-    hxx, hxy, hyy = np.float64(dot(J[1], J[1])), np.float64(dot(J[1], J[2])), np.float64(dot(J[2], J[2]))
-    determinant, n = hxx * hyy - hxy * hxy, SIZE * SIZE
+    (h, w), n, sums = current.shape, SIZE * SIZE, np.empty(9)
+    prepare(patch, J, sums)
+    middle = patch[RADIUS + 1, RADIUS + 1]
+    base, energy = sums[0] / n, sums[3] - sums[0] * sums[0] / n + 1e-3
+    along_u, along_v = sums[4] - base * sums[1], sums[5] - base * sums[2]
+    hxx = sums[6] - sums[1] * sums[1] / n - along_u * along_u / energy
+    hxy = sums[7] - sums[1] * sums[2] / n - along_u * along_v / energy
+    hyy = sums[8] - sums[2] * sums[2] / n - along_v * along_v / energy
+    determinant = hxx * hyy - hxy * hxy
     if determinant < 1e-6 * n * n or hxx + hyy < n * 0.2:
         return False, u, v
-    for _ in range(steps):
-        inside, bt, bx, by = products(current, u, v, J)
-        if not inside:
+    for _ in range(SLIDES):
+        if not (u >= RADIUS + 1.0 and v >= RADIUS + 1.0 and u + RADIUS + 3.0 < w and v + RADIUS + 3.0 < h):
             return False, u, v
+        c, r = int(u), int(v)
+        s0, s1, s2, total = products(current, c, r, np.float32(u - c), np.float32(v - r), middle, J)
+        bt = s0 - base * total
+        bx, by = s1 - sums[1] / n * total - along_u / energy * bt, s2 - sums[2] / n * total - along_v / energy * bt
         du, dv = (hyy * bx - hxy * by) / determinant, (hxx * by - hxy * bx) / determinant
-        gain = min(max((bt - along[1] * du - along[2] * dv) / along[0], 0.5), 2.0)
+        gain = min(max((bt - along_u * du - along_v * dv) / energy, 0.5), 2.0)
         du, dv = du / gain, dv / gain
         u, v = u - du, v - dv
-        if du * du + dv * dv < 4e-4:
+        if du * du + dv * dv < SETTLED:
             break
     return True, u, v
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def follow(previous, current, start, maps, uv, lowest, steps, ok):
-    """Move guesses uv (N, 2), in place, by translation of patches, from the coarsest pyramid level to lowest.
+def descend(previous, newest, start, M, uv, lowest, patch, J):
+    """Improve a guess uv (2,), in place, by translation, from the coarsest pyramid level to lowest; False: not found.
 
-    What is at uv + x in current is at start + maps x in previous, maps (N, 2, 2). Only rows with ok (N,) are looked at;
-    it becomes False where level 0 has no answer (a coarse one may be left out).
+    What is at uv + x in the newest image is at start + M x in the previous one. Only level 0 has to have an answer.
     """
-    patch, J = np.zeros((SIZE + 2, LANES + 2), np.float32), np.empty((3, AREA), np.float32)
-    for i in range(len(start)):
-        if not ok[i]:
-            continue
-        u, v = uv[i]
-        for level in range(len(previous) - 1, lowest - 1, -1):
-            scale = 0.5 ** level
-            good, a, b = slide(previous[level], current[level], start[i, 0] * scale, start[i, 1] * scale, maps[i],
-                               u * scale, v * scale, steps, patch, J)
-            if good:
-                u, v = a / scale, b / scale
-            elif level == 0:
-                ok[i] = False
-        uv[i, 0], uv[i, 1] = u, v
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def learn(image, uv, templates, inverses, ok):
-    """Remember the patches at uv (N, 2) of the rows with ok (N,), which becomes False where it is not possible.
-
-    templates (N, SIZE + 2, LANES + 2), inverses (N, 6, 6) of the normal matrix.
-    """
-    J, H, along = np.empty((7, AREA), np.float32), np.empty((6, 6)), np.empty(7)
-    for i in range(len(uv)):
-        if not ok[i]:
-            continue
-        templates[i, :, LANES + 1] = 0.0
-        ok[i] = cut(image, uv[i, 0], uv[i, 1], templates[i])
-        if not ok[i]:
-            continue
-        steepest(templates[i], J, along)
-        for p in range(6):
-            for q in range(p + 1):
-                H[p, q] = H[q, p] = dot(J[1 + p], J[1 + q])
-            H[p, p] += STIFFNESS if p > 1 else 1e-3
-        ok[i] = H[0, 0] * H[1, 1] - H[0, 1] ** 2 >= 1e-3 * SIZE**4
-        if ok[i]:
-            inverses[i] = np.linalg.inv(H)
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def improve(uv, A, d):
-    """Compose the map x -> uv + A x, in place, with the inverse of x -> x + D x + d; False if that is degenerate.
-
-    d (6,): u, v, then D per RADIUS by rows.
-    """
-    d00, d01, d10, d11 = 1.0 + d[2] / RADIUS, d[3] / RADIUS, d[4] / RADIUS, 1.0 + d[5] / RADIUS
-    determinant = d00 * d11 - d01 * d10
-    if not determinant > 0.25:
-        return False
-    i00, i01, i10, i11 = d11 / determinant, -d01 / determinant, -d10 / determinant, d00 / determinant
-    a00, a01, a10, a11 = A[0, 0], A[0, 1], A[1, 0], A[1, 1]
-    A[0, 0], A[0, 1] = a00 * i00 + a01 * i10, a00 * i01 + a01 * i11
-    A[1, 0], A[1, 1] = a10 * i00 + a11 * i10, a10 * i01 + a11 * i11
-    uv[0] -= A[0, 0] * d[0] + A[0, 1] * d[1]
-    uv[1] -= A[1, 0] * d[0] + A[1, 1] * d[1]
-    return True
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def align(image, templates, inverses, uv, shapes, steps, score):
-    """Align remembered patches with image by an affine warp.
-
-    templates and inverses as learned; guesses uv (N, 2) and shapes (N, 2, 2) are improved in place.
-    score (N,): correlation of the aligned patches, 0 when they left the image.
-    """
-    square, J = np.zeros((SIZE, LANES), np.float32), np.empty((7, AREA), np.float32)
-    moved, along, right, d, n = square.reshape(-1), np.empty(7), np.empty(6), np.empty(6), SIZE * SIZE
-    for i in range(len(uv)):
-        base = steepest(templates[i], J, along)
-        settled = False
-        for step in range(steps + 1):
-            score[i] = 0.0
-            if not warp(image, uv[i, 0], uv[i, 1], shapes[i], RADIUS, base, square):
-                break
-            product, mean = dot(J[0], moved), dot(moved, INSIDE) / n
-            score[i] = product / np.sqrt(max((dot(moved, moved) - n * mean * mean) * along[0], 1.0))
-            if settled or step == steps:
-                break
-            gain = np.float64(product)
-            for p in range(6):
-                right[p] = dot(J[1 + p], moved)
-            for p in range(6):
-                d[p] = 0.0
-                for q in range(6):
-                    d[p] += inverses[i, p, q] * right[q]
-                gain -= along[1 + p] * d[p]
-            d /= min(max(gain / along[0], 0.5), 2.0)
-            if not improve(uv[i], shapes[i], d):
-                score[i] = 0.0
-                break
-            settled = d[0] * d[0] + d[1] * d[1] < 4e-4
+    good = True
+    for level in range(len(previous) - 1 if lowest > 0 else 0, lowest - 1, -1):
+        scale = 0.5**level
+        good, u, v = slide(previous[level], newest[level], start[0] * scale, start[1] * scale, M, uv[0] * scale,
+                           uv[1] * scale, patch, J)
+        if good:
+            uv[0], uv[1] = u / scale, v / scale
+    return good or lowest > 0

@@ -69,7 +69,7 @@ def _fit_rotation(x1, x2, threshold, R):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def _epipolar_distance(X, x2, t):
-    """Signed distance of x2 (2,) to the line t x X of a turned ray X (3,); 0 where that line is undefined."""
+    """Signed distance of x2 (2,) to the line t x X of a turned ray X (3 numbers); 0 where that line is undefined."""
     n0, n1, n2 = t[1] * X[2] - t[2] * X[1], t[2] * X[0] - t[0] * X[2], t[0] * X[1] - t[1] * X[0]
     rho = np.sqrt(n0 * n0 + n1 * n1)
     if rho < 1e-12:
@@ -77,37 +77,49 @@ def _epipolar_distance(X, x2, t):
     return (n0 * x2[0] + n1 * x2[1] + n2) / rho
 
 
+@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+def _cost(X, x2, t, limit):
+    """Sum of squared distances, limit at most, of x2 (2, N) to the lines t x X of turned rays X (3, N)."""
+    total = 0.0
+    for k in range(X.shape[1]):
+        n0, n1, n2 = t[1] * X[2, k] - t[2] * X[1, k], t[2] * X[0, k] - t[0] * X[2, k], t[0] * X[1, k] - t[1] * X[0, k]
+        e = n0 * x2[0, k] + n1 * x2[1, k] + n2
+        total += min(e * e / max(n0 * n0 + n1 * n1, 1e-24), limit)
+    return total
+
+
 @njit(cache=True, nogil=True, error_model='numpy')
 def _consensus(x1, x2, threshold, rotation_sigma, R, keep):
     """Fill keep (N,) and improve R: the best two-point hypothesis, refined together with the rotation, then gated."""
     n = len(x1)
-    X, moment = np.empty((n, 3)), np.empty((n, 3))
+    X, moment, seen = np.empty((3, n)), np.empty((n, 3)), np.empty((2, n))
     for i in range(n):
-        X[i, 0], X[i, 1], X[i, 2] = _turn(R, x1[i])
-        moment[i, 0] = X[i, 1] - X[i, 2] * x2[i, 1]
-        moment[i, 1] = X[i, 2] * x2[i, 0] - X[i, 0]
-        moment[i, 2] = X[i, 0] * x2[i, 1] - X[i, 1] * x2[i, 0]
-    t, best = np.array([0.0, 0.0, 1.0]), np.inf
+        X[0, i], X[1, i], X[2, i] = _turn(R, x1[i])
+        seen[0, i], seen[1, i] = x2[i]
+        moment[i, 0] = X[1, i] - X[2, i] * x2[i, 1]
+        moment[i, 1] = X[2, i] * x2[i, 0] - X[0, i]
+        moment[i, 2] = X[0, i] * x2[i, 1] - X[1, i] * x2[i, 0]
+    t, guess, best = np.array([0.0, 0.0, 1.0]), np.empty(3), np.inf
     state = np.uint64(88172645463325252)  # xorshift64 (Marsaglia, 2003): the same draws in every run
     for _ in range(HYPOTHESES):
         state ^= state << np.uint64(13)
         state ^= state >> np.uint64(7)
         state ^= state << np.uint64(17)
         a, b = moment[int(state % np.uint64(n))], moment[int((state >> np.uint64(32)) % np.uint64(n))]
-        guess = np.cross(a, b)
-        length = np.sqrt(np.sum(guess * guess))
+        for p in range(3):
+            q, r = (p + 1) % 3, (p + 2) % 3
+            guess[p] = a[q] * b[r] - a[r] * b[q]
+        length = np.sqrt(guess[0] ** 2 + guess[1] ** 2 + guess[2] ** 2)
         if length < 1e-14:
             continue
         guess /= length
-        cost = 0.0
-        for k in range(n):
-            cost += min(_epipolar_distance(X[k], x2[k], guess) ** 2, 4.0 * threshold * threshold)
+        cost = _cost(X, seen, guess, 4.0 * threshold * threshold)
         if cost < best:
-            best, t = cost, guess
+            best = cost
+            t[:] = guess
     _refine(x1, x2, threshold, rotation_sigma, R, t)
     for k in range(n):
-        X[k, 0], X[k, 1], X[k, 2] = _turn(R, x1[k])
-        keep[k] = abs(_epipolar_distance(X[k], x2[k], t)) < threshold
+        keep[k] = abs(_epipolar_distance(_turn(R, x1[k]), x2[k], t)) < threshold
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -142,12 +154,16 @@ def _refine(x1, x2, threshold, rotation_sigma, R, t):
             k0, k1, k2 = X1 * m2 - X2 * m1, X2 * m0 - X0 * m2, X0 * m1 - X1 * m0  # X1 x (x2 x t)
             for p in range(3):
                 J[p] = (R[0, p] * k0 + R[1, p] * k1 + R[2, p] * k2) / rho
-            J[3], J[4] = np.dot(e1, c) / rho, np.dot(e2, c) / rho
+            J[3] = (e1[0] * c[0] + e1[1] * c[1] + e1[2] * c[2]) / rho
+            J[4] = (e2[0] * c[0] + e2[1] * c[1] + e2[2] * c[2]) / rho
             weight = 1.0 / (1.0 + (r / threshold) ** 2)
             for p in range(5):
                 b[p] -= weight * J[p] * r
-                for q in range(5):
+                for q in range(p + 1):
                     A[p, q] += weight * J[p] * J[q]
+        for p in range(5):
+            for q in range(p):
+                A[q, p] = A[p, q]
         d = np.linalg.solve(A, b)
         change += d[:3]
         retract_rotation(R, d[:3], R)

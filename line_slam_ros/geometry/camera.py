@@ -18,6 +18,7 @@ from typing import Protocol
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
@@ -66,13 +67,11 @@ class Camera:
 
     def normalise(self, uv: F64) -> F64:
         """Pixels (N, 2) to undistorted normalised coordinates (N, 2); NaN where the model has no inverse."""
-        with np.errstate(invalid='ignore', over='ignore', divide='ignore'):
-            return self._lens.undistort((np.asarray(uv, float) - self._centre) / self._focals)
+        return self._lens.undistort((np.asarray(uv, float) - self._centre) / self._focals)
 
     def project(self, x: F64) -> F64:
         """Normalised coordinates (N, 2) to pixels (N, 2); NaN outside the region where the model is one to one."""
-        with np.errstate(invalid='ignore', over='ignore', divide='ignore'):
-            return self._lens.distort(np.asarray(x, float)) * self._focals + self._centre
+        return self._lens.distort(np.asarray(x, float)) * self._focals + self._centre
 
     def rectified(self, scale: float = 1.0) -> Rectification:
         """The pinhole canvas with focal length * scale that keeps the field of view, up to WIDEST_CANVAS per side."""
@@ -115,74 +114,139 @@ class _Radtan:
     """k1 k2 p1 p2 [k3 [k4 k5 k6]]; see the module."""
 
     def __init__(self, coefficients: F64) -> None:
-        self._coefficients = k1, k2, _, _, k3, k4, k5, k6 = np.pad(coefficients, (0, 8 - len(coefficients))).tolist()
+        self._coefficients = np.pad(coefficients, (0, 8 - len(coefficients)))
+        k1, k2, _, _, k3, k4, k5, k6 = self._coefficients
         s, over, under = Polynomial([0.0, 1.0]), Polynomial([1.0, k1, k2, k3]), Polynomial([1.0, k4, k5, k6])
         growth = over * under + 2.0 * s * (over.deriv() * under - over * under.deriv())  # d(g r)/dr times under^2
         self._widest = np.sqrt(min(_first_positive_root(growth), _first_positive_root(under)))
         self._table = np.linspace(0.0, min(self._widest, 10.0), 1024)
         self._table_d = self._table * over(self._table**2) / under(self._table**2)
 
-    def _bend(self, x: F64, y: F64) -> tuple[F64, F64, F64, F64, F64]:
-        """Distorted x, y and the symmetric derivative dx_d/dx, dx_d/dy = dy_d/dx, dy_d/dy, all (N,)."""
-        k1, k2, p1, p2, k3, k4, k5, k6 = self._coefficients
-        s = x * x + y * y
-        under = 1.0 + s * (k4 + s * (k5 + s * k6))
-        gain = (1.0 + s * (k1 + s * (k2 + s * k3))) / under
-        slope = (k1 + s * (2.0 * k2 + 3.0 * s * k3) - gain * (k4 + s * (2.0 * k5 + 3.0 * s * k6))) / under  # dg/ds
-        return (gain * x + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x),
-                gain * y + 2.0 * p2 * x * y + p1 * (s + 2.0 * y * y),
-                gain + 2.0 * slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x,
-                2.0 * slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y,
-                gain + 2.0 * slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x)
-
     def distort(self, x: F64) -> F64:
-        inside = np.sum(x * x, axis=-1, keepdims=True) < self._widest**2
-        return np.where(inside, np.column_stack(self._bend(*x.T)[:2]), np.nan)
+        _distort_radtan(self._coefficients, self._widest, x, x_d := np.empty(x.shape))
+        return x_d
 
     def undistort(self, x_d: F64) -> F64:
         """Newton's method from the inverse of the radial part; NaN where it does not converge in the valid region."""
-        r_d = np.linalg.norm(x_d, axis=-1)
-        x, y = x_d.T * np.interp(r_d, self._table_d, self._table) / np.where(r_d == 0.0, 1.0, r_d)
-        for _ in range(NEWTON_STEPS):
-            bent_x, bent_y, xx, xy, yy = self._bend(x, y)
-            error_x, error_y, determinant = bent_x - x_d[:, 0], bent_y - x_d[:, 1], xx * yy - xy * xy
-            step_x = (yy * error_x - xy * error_y) / determinant
-            step_y = (xx * error_y - xy * error_x) / determinant
-            x, y, step = x - step_x, y - step_y, np.abs(step_x) + np.abs(step_y)
-            if not np.any(step > CONVERGED):
-                break
-        found = (step <= CONVERGED) & (determinant > 0.0) & (x * x + y * y < self._widest**2)
-        return np.where(found[:, None], np.column_stack([x, y]), np.nan)
+        _undistort_radtan(self._coefficients, self._widest, self._table, self._table_d, x_d, x := np.empty(x_d.shape))
+        return x
 
 
 class _Equidistant:
     """k1 k2 k3 k4; see the module."""
 
     def __init__(self, coefficients: F64) -> None:
+        self._coefficients = np.array(coefficients)
         odd = np.zeros(10)
         odd[1::2] = [1.0, *coefficients]
-        self._angle_d = Polynomial(odd)  # of theta
-        self._growth = self._angle_d.deriv()
-        self._widest = min(_first_positive_root(self._growth), np.pi / 2.0)
+        angle_d = Polynomial(odd)  # of theta
+        self._widest = min(_first_positive_root(angle_d.deriv()), np.pi / 2.0)
         self._table = np.linspace(0.0, self._widest, 1024)
-        self._table_d = self._angle_d(self._table)
+        self._table_d = angle_d(self._table)
 
     def distort(self, x: F64) -> F64:
-        r = np.linalg.norm(x, axis=-1, keepdims=True)
-        angle = np.where(np.arctan(r) < self._widest, np.arctan(r), np.nan)
-        return x * np.where(r == 0.0, 1.0, self._angle_d(angle) / r)
+        _distort_equidistant(self._coefficients, self._widest, x, x_d := np.empty(x.shape))
+        return x_d
 
     def undistort(self, x_d: F64) -> F64:
         """Newton's method on the angle; NaN at and beyond 90 degrees, where the plane z = 1 ends."""
-        r_d = np.linalg.norm(x_d, axis=-1, keepdims=True)
-        angle = np.interp(r_d, self._table_d, self._table)
+        _undistort_equidistant(self._coefficients, self._widest, self._table, self._table_d, x_d,
+                               x := np.empty(x_d.shape))
+        return x
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _look_up(at, table_at, table):
+    """Value of table at a place between those of the growing table_at, linear between; constant beyond them."""
+    k = min(max(np.searchsorted(table_at, at), 1), len(table) - 1)
+    share = (at - table_at[k - 1]) / (table_at[k] - table_at[k - 1])
+    return table[k - 1] + min(max(share, 0.0), 1.0) * (table[k] - table[k - 1])
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _bend(coefficients, x, y):
+    """Distorted x, y and the symmetric derivative dx_d/dx, dx_d/dy = dy_d/dx, dy_d/dy; radtan."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
+    s = x * x + y * y
+    under = 1.0 + s * (k4 + s * (k5 + s * k6))
+    gain = (1.0 + s * (k1 + s * (k2 + s * k3))) / under
+    slope = (k1 + s * (2.0 * k2 + 3.0 * s * k3) - gain * (k4 + s * (2.0 * k5 + 3.0 * s * k6))) / under  # dg/ds
+    return (gain * x + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x),
+            gain * y + 2.0 * p2 * x * y + p1 * (s + 2.0 * y * y),
+            gain + 2.0 * slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x,
+            2.0 * slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y,
+            gain + 2.0 * slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _distort_radtan(coefficients, widest, x, x_d):
+    """Fill x_d (N, 2) from x (N, 2)."""
+    k = (coefficients[0], coefficients[1], coefficients[2], coefficients[3], coefficients[4], coefficients[5],
+         coefficients[6], coefficients[7])
+    for i in range(len(x)):
+        x_d[i, 0], x_d[i, 1] = np.nan, np.nan
+        if x[i, 0] * x[i, 0] + x[i, 1] * x[i, 1] < widest * widest:
+            x_d[i, 0], x_d[i, 1], _, _, _ = _bend(k, x[i, 0], x[i, 1])
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _undistort_radtan(coefficients, widest, table, table_d, x_d, x):
+    """Fill x (N, 2) from x_d (N, 2)."""
+    k = (coefficients[0], coefficients[1], coefficients[2], coefficients[3], coefficients[4], coefficients[5],
+         coefficients[6], coefficients[7])
+    for i in range(len(x_d)):
+        r_d = np.sqrt(x_d[i, 0] * x_d[i, 0] + x_d[i, 1] * x_d[i, 1])
+        scale = _look_up(r_d, table_d, table) / r_d if r_d > 0.0 else 1.0
+        u, v, step, determinant = scale * x_d[i, 0], scale * x_d[i, 1], np.inf, 0.0
         for _ in range(NEWTON_STEPS):
-            step = (self._angle_d(angle) - r_d) / self._growth(angle)
-            angle = angle - step
-            if not np.any(np.abs(step) > CONVERGED):
+            bent_u, bent_v, uu, uv, vv = _bend(k, u, v)
+            error_u, error_v, determinant = bent_u - x_d[i, 0], bent_v - x_d[i, 1], uu * vv - uv * uv
+            step_u, step_v = (vv * error_u - uv * error_v) / determinant, (uu * error_v - uv * error_u) / determinant
+            u, v, step = u - step_u, v - step_v, abs(step_u) + abs(step_v)
+            if not step > CONVERGED:
                 break
-        angle = np.where((np.abs(step) <= CONVERGED) & (angle < self._widest), angle, np.nan)
-        return x_d * np.where(r_d == 0.0, 1.0, np.tan(angle) / r_d)
+        found = step <= CONVERGED and determinant > 0.0 and u * u + v * v < widest * widest
+        x[i, 0], x[i, 1] = (u, v) if found else (np.nan, np.nan)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _angle(coefficients, theta):
+    """Distorted angle of theta and its derivative; equidistant."""
+    k1, k2, k3, k4 = coefficients
+    s = theta * theta
+    return (theta * (1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4)))),
+            1.0 + s * (3.0 * k1 + s * (5.0 * k2 + s * (7.0 * k3 + s * 9.0 * k4))))
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _distort_equidistant(coefficients, widest, x, x_d):
+    """Fill x_d (N, 2) from x (N, 2)."""
+    k = coefficients[0], coefficients[1], coefficients[2], coefficients[3]
+    for i in range(len(x)):
+        r = np.sqrt(x[i, 0] * x[i, 0] + x[i, 1] * x[i, 1])
+        scale = np.nan
+        if np.arctan(r) < widest:
+            scale = _angle(k, np.arctan(r))[0] / r if r > 0.0 else 1.0
+        x_d[i, 0], x_d[i, 1] = scale * x[i, 0], scale * x[i, 1]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _undistort_equidistant(coefficients, widest, table, table_d, x_d, x):
+    """Fill x (N, 2) from x_d (N, 2)."""
+    k = coefficients[0], coefficients[1], coefficients[2], coefficients[3]
+    for i in range(len(x_d)):
+        r_d = np.sqrt(x_d[i, 0] * x_d[i, 0] + x_d[i, 1] * x_d[i, 1])
+        theta, step = _look_up(r_d, table_d, table), np.inf
+        for _ in range(NEWTON_STEPS):
+            angle_d, growth = _angle(k, theta)
+            step = (angle_d - r_d) / growth
+            theta -= step
+            if not abs(step) > CONVERGED:
+                break
+        scale = np.nan
+        if abs(step) <= CONVERGED and theta < widest:
+            scale = np.tan(theta) / r_d if r_d > 0.0 else 1.0
+        x[i, 0], x[i, 1] = scale * x_d[i, 0], scale * x_d[i, 1]
 
 
 MODELS = {'radtan': _Radtan, 'equidistant': _Equidistant}

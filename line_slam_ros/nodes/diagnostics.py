@@ -46,6 +46,7 @@ class Diagnostics:
         kind = self._new.type('diagnostic_msgs/msg/DiagnosticArray')
         self._publisher = node.create_publisher(kind, '/diagnostics', 10, event_callbacks=NO_EVENTS)
         self.waiting_for = ''
+        self.frames_behind = 0  # processed in a hurry, since the start
         self._status, self._resets, self._poses = Status.INITIALISING, 0, 0
         self._rig: RigCorrection | None = None
         self._latency = Latency()
@@ -73,7 +74,7 @@ class Diagnostics:
         values = {name: f'{stream.measure(seconds):.1f} Hz' for name, stream in self._inputs.streams.items()}
         warnings = list(self._warnings(now))
         values |= {'frames processed': f'{latency.frames / seconds:.1f} Hz', 'poses': f'{poses / seconds:.1f} Hz',
-                   'frames waiting': str(self._inputs.inbox.ready),
+                   'frames waiting': str(self._inputs.inbox.ready), 'frames behind': str(self.frames_behind),
                    'resets': str(self._resets), 'executor CPU': f'{100 * (cpu - self._cpu_then) / seconds:.0f} %',
                    **refinement(self._rig), **latency.summary(),
                    **{f'dropped: {reason}': str(n) for reason, n in self._drops.items()}}

@@ -37,6 +37,7 @@ from line_slam_ros.types import Calibration, Estimate, ImuBatch, LineSegments
 RCLError = rclpy_implementation.RCLError
 SWITCH_INTERVAL_S = 5e-4  # how long the worker may keep the executor waiting; Python's 5 ms cost IMU latency
 SAVING_PAUSE_S = 4e-3  # between rows of a map that is saved, for the worker to go on
+BEHIND = 2  # frames that wait for the worker before it hurries; one is jitter
 WARM_UP_CALIBRATION = Calibration('radtan', 752, 480, (450.0, 450.0, 376.0, 240.0), (0.0, 0.0, 0.0, 0.0), np.eye(4))
 
 
@@ -116,17 +117,18 @@ class LineSlamNode(Node):
         for frame, companion in self._incoming.inbox:
             if self._stopping:
                 return
-            taken = time.perf_counter()
+            taken, behind = time.perf_counter(), self._incoming.inbox.ready >= BEHIND
             noise = gyro_variance(calibration.imu_noise, companion) if isinstance(companion, ImuBatch) else 0.0
             with self._in_use:
                 if self._incoming.inbox.jumped:
                     self._reset('time jumped back')
                 try:
-                    estimate = step(frame, companion)
+                    estimate = step(frame, companion, behind)
                 except ValueError as error:
                     self._incoming.inbox.reject('image not usable', str(error), frame.t_ns)
                 else:
                     self._publish(slam, frame.t_ns, estimate, noise, taken)
+                    self._diagnostics.frames_behind += behind
 
     def _publish(self, slam: Slam | LineMapper, t_ns: int, estimate: Estimate | None, gyro_noise: float,
                  taken: float) -> None:

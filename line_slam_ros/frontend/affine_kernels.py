@@ -1,0 +1,197 @@
+"""Compiled alignment of learned patches with an image by an affine warp (see patch_kernels.py).
+
+Of the template only the grey T and its two derivatives are kept: the Jacobian images are these times the coordinates,
+and two numbers each correct their products with the image for not being orthogonal:
+
+    template (3, AREA)   grey without mean, its derivatives by u and v
+    moments (2, 7)       products of the 7 images (grey, then 6 of the Jacobian) with the grey, and their means
+    inverse (6, 6)       of the normal matrix
+"""
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from line_slam_ros.frontend.patch_kernels import (
+    AREA,
+    DOWN,
+    INSIDE,
+    LANES,
+    RADIUS,
+    RIGHT,
+    SETTLED,
+    SIZE,
+    cut,
+    dot,
+    gradient,
+)
+
+STIFFNESS = 50.0  # a weak belief that the shape does not change
+STEPS = 5  # iterations at most
+FARTHEST = 32  # px, reach of a warped patch
+
+
+@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+def steepest(patch, J, moments):
+    """Fill J (7, AREA) of a patch: its grey without mean, then the images of the parameters.
+
+    These are u, v and the affine uu, uv, vu, vv (per RADIUS), made orthogonal to the grey and to 1.
+    moments (2, 7): products with the grey before that, and means.
+    """
+    gradient(patch, J)
+    for p in range(3, 7):
+        image, by, weight = J[p], J[1 + (p - 3) // 2], RIGHT if p % 2 else DOWN
+        for k in range(AREA):
+            image[k] = by[k] * weight[k]
+    area, grey = np.float32(SIZE * SIZE), J[0]
+    for p in range(7):
+        moments[1, p] = dot(J[p], INSIDE) / area
+    base = np.float32(moments[1, 0])
+    for k in range(AREA):
+        grey[k] = (grey[k] - base) * INSIDE[k]
+    moments[0, 0] = dot(grey, grey) + 1e-3
+    for p in range(1, 7):
+        image, mean = J[p], np.float32(moments[1, p])
+        moments[0, p] = dot(grey, image)
+        share = np.float32(moments[0, p] / moments[0, 0])
+        for k in range(AREA):
+            image[k] = (image[k] - mean - share * grey[k]) * INSIDE[k]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def learn(image, uv, slots, templates, moments, inverses, ok):
+    """Remember the patches at uv (N, 2) of the rows with ok (N,), which becomes False where it is not possible.
+
+    Fills rows slots (N,) of templates, moments and inverses, see the module.
+    """
+    J, H, patch = np.empty((7, AREA), np.float32), np.empty((6, 6)), np.zeros((SIZE + 2, LANES + 2), np.float32)
+    for i in range(len(uv)):
+        if not ok[i]:
+            continue
+        ok[i] = cut(image, uv[i, 0], uv[i, 1], patch)
+        if not ok[i]:
+            continue
+        slot = slots[i]
+        gradient(patch, templates[slot])
+        steepest(patch, J, moments[slot])
+        templates[slot, 0] = J[0]
+        templates[slot, 1] *= INSIDE
+        templates[slot, 2] *= INSIDE
+        for p in range(6):
+            for q in range(p + 1):
+                H[p, q] = H[q, p] = dot(J[1 + p], J[1 + q])
+            H[p, p] += STIFFNESS if p > 1 else 1e-3
+        ok[i] = H[0, 0] * H[1, 1] - H[0, 1] ** 2 >= 1e-3 * SIZE**4
+        if ok[i]:
+            inverses[slot] = np.linalg.inv(H)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def inside(shape, u, v, A):
+    """Does a patch at (u, v) + A (x, y) lie in the image, and not too far apart?"""
+    reach_u = RADIUS * (abs(A[0, 0]) + abs(A[0, 1]))
+    reach_v = (RADIUS + 1) * abs(A[1, 0]) + RADIUS * abs(A[1, 1])
+    return u - reach_u >= 1.0 and v - reach_v >= 1.0 and u + reach_u < shape[1] - 2.0 \
+        and v + reach_v < shape[0] - 2.0 and reach_u < FARTHEST and reach_v < FARTHEST
+
+
+@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+def bend(pairs, shape, u, v, A, base, moved):
+    """Fill moved (AREA,) with grey minus base at (u, v) + A (x, y), last column 0. It must be inside().
+
+    pairs: neighbours() of the image of this shape.
+    """
+    w = shape[1]
+    index, tops, lows = np.empty(AREA, np.int32), np.empty(AREA, np.uint16), np.empty(AREA, np.uint16)
+    right, down = np.empty(AREA, np.float32), np.empty(AREA, np.float32)
+    first_u, first_v = int(u) - FARTHEST, int(v) - FARTHEST  # small numbers from there on: exact enough in 32 bits
+    at_u, at_v, width = np.float32(u - first_u), np.float32(v - first_v), np.int32(w)
+    corner, below = first_v * w + first_u, np.uintp(w)
+    a00, a01 = np.float32(A[0, 0] * RADIUS), np.float32(A[0, 1] * RADIUS)
+    a10, a11 = np.float32(A[1, 0] * RADIUS), np.float32(A[1, 1] * RADIUS)
+    byte, shift = np.uint16(255), np.uint16(8)
+    for k in range(AREA):
+        x, y = at_u + a00 * RIGHT[k] + a01 * DOWN[k], at_v + a10 * RIGHT[k] + a11 * DOWN[k]
+        c, r = np.int32(x), np.int32(y)
+        index[k] = r * width + c
+        right[k], down[k] = x - np.float32(c), y - np.float32(r)
+    for k in range(AREA):
+        at = np.uintp(index[k] + corner)
+        tops[k], lows[k] = pairs[at], pairs[at + below]
+    for k in range(AREA):
+        a, b = np.float32(np.int32(tops[k] & byte)), np.float32(np.int32(tops[k] >> shift))
+        c, d = np.float32(np.int32(lows[k] & byte)), np.float32(np.int32(lows[k] >> shift))
+        top, low = a + right[k] * (b - a), c + right[k] * (d - c)
+        moved[k] = (top + down[k] * (low - top) - base) * INSIDE[k]
+
+
+@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+def projections(template, moved, right):
+    """Fill right (7,) with products of the grey and of the 6 Jacobian images with moved; (sum, squares) of moved."""
+    zero = np.float32(0.0)
+    grey, by_u, by_v = template[0], template[1], template[2]
+    g = p = px = py = q = qx = qy = total = squares = zero
+    for k in range(AREA):
+        m, x, y = moved[k], RIGHT[k], DOWN[k]
+        a, b = by_u[k] * m, by_v[k] * m
+        g += grey[k] * m
+        total += m
+        squares += m * m
+        p += a
+        px += a * x
+        py += a * y
+        q += b
+        qx += b * x
+        qy += b * y
+    right[0], right[1], right[2], right[3], right[4], right[5], right[6] = g, p, q, px, py, qx, qy
+    return total, squares
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def improve(uv, A, d):
+    """Compose the map x -> uv + A x, in place, with the inverse of x -> x + D x + d; False if that is degenerate.
+
+    d (6,): u, v, then D per RADIUS by rows.
+    """
+    d00, d01, d10, d11 = 1.0 + d[2] / RADIUS, d[3] / RADIUS, d[4] / RADIUS, 1.0 + d[5] / RADIUS
+    determinant = d00 * d11 - d01 * d10
+    if not determinant > 0.25:
+        return False
+    i00, i01, i10, i11 = d11 / determinant, -d01 / determinant, -d10 / determinant, d00 / determinant
+    a00, a01, a10, a11 = A[0, 0], A[0, 1], A[1, 0], A[1, 1]
+    A[0, 0], A[0, 1] = a00 * i00 + a01 * i10, a00 * i01 + a01 * i11
+    A[1, 0], A[1, 1] = a10 * i00 + a11 * i10, a10 * i01 + a11 * i11
+    uv[0] -= A[0, 0] * d[0] + A[0, 1] * d[1]
+    uv[1] -= A[1, 0] * d[0] + A[1, 1] * d[1]
+    return True
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def align(pairs, shape, template, moments, inverse, uv, A, moved, right, d):
+    """Align a learned patch with the image by an affine warp: the guesses uv (2,) and A (2, 2) are improved in place.
+
+    Returns their correlation, 0 when the patch left the image. moved (AREA,), right (7,), d (6,): work space.
+    """
+    n, base, energy, score = SIZE * SIZE, np.float32(moments[1, 0]), moments[0, 0], 0.0
+    for _ in range(STEPS):
+        if not inside(shape, uv[0], uv[1], A):
+            return 0.0
+        bend(pairs, shape, uv[0], uv[1], A, base, moved)
+        total, squares = projections(template, moved, right)
+        score = right[0] / np.sqrt(max((squares - total * total / n) * energy, 1.0))
+        gain = right[0]
+        for p in range(1, 7):
+            right[p] -= moments[1, p] * total + moments[0, p] / energy * right[0]
+        for p in range(6):
+            d[p] = 0.0
+            for q in range(6):
+                d[p] += inverse[p, q] * right[1 + q]
+            gain -= moments[0, 1 + p] * d[p]
+        gain = min(max(gain / energy, 0.5), 2.0)
+        for p in range(6):
+            d[p] /= gain
+        if not improve(uv, A, d):
+            return 0.0
+        if d[0] * d[0] + d[1] * d[1] < SETTLED:
+            break
+    return score
