@@ -23,3 +23,8 @@ def bgr_pixels(msg: Any) -> U8:
 def diagnosis(msg: Any, name: str) -> str:
     """The message of one status in a diagnostic_msgs/DiagnosticArray, '' if it holds no such status."""
     return next((status.message for status in msg.status if status.name == name), '')
+
+
+def diagnosis_values(msg: Any, name: str) -> dict[str, str]:
+    """Key to value of one status in a diagnostic_msgs/DiagnosticArray, empty if it holds no such status."""
+    return next(({pair.key: pair.value for pair in status.values} for status in msg.status if status.name == name), {})

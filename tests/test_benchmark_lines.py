@@ -73,7 +73,7 @@ def test_numbers_that_make_no_sense_are_refused(words, tmp_path):
     assert caught.value.code == 2
 
 
-@pytest.mark.parametrize('kind', ['recordings', 'consistency', 'lines'])
+@pytest.mark.parametrize('kind', ['recordings', 'consistency', 'lines', 'speed'])
 def test_help_is_quick_to_load(kind):
     code = ('import sys; from line_slam_ros.cli.main import main\n'
             f'try: main(["benchmark", "{kind}", "--help"])\nexcept SystemExit: pass\n'

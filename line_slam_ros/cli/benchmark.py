@@ -1,4 +1,4 @@
-"""``line_slam benchmark``: accuracy on recordings, honesty of the covariance, speed of the line solver."""
+"""``line_slam benchmark``: accuracy on recordings, honesty of the covariance, speed."""
 from __future__ import annotations
 
 import argparse
@@ -54,16 +54,33 @@ with a fixed calibration kernel, and prints medians and the ratio to the kernel,
 and what else it does. DIR holds cam_pose_tum.txt, house.txt and observations.txt; default: a simulated house with about
 30 000 observations. Writes lines.json and lines.md.
 """
+_SPEED = """\
+Times a recording, each part in processes of its own, and compares with a reference. Parts:
+
+    frames    wall and CPU time by stage with one thread and with two, and of the whole command line_slam replay
+    startup   of line_slam replay, with an empty and with a filled cache of compiled code
+    memory    resident memory while the recording is shown forwards and backwards, again and again
+    growth    of the stages with points, lines, window, image size and lines in the map; a plot
+    live      line_slam_node over DDS (needs ROS 2), as recorded and three times as fast: age of its poses, drops,
+              CPU time by thread, cost of messages
+
+Each writes PART.json and PART.md. The reference holds the figures in units of a fixed calibration kernel that was timed
+in the same run, so that they can be compared with those of another machine or hour; what takes more than 1.3 times the
+reference is marked.
+"""
+PARTS = 'frames', 'startup', 'memory', 'growth', 'live'
+_CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser('benchmark', help='measure accuracy, consistency and speed',
                                    description='Measures accuracy on recordings, consistency of the covariance on '
-                                               'simulated features, and the speed of the line solver.')
+                                               'simulated features, and speed.')
     kinds = parser.add_subparsers(dest='kind', required=True, metavar='KIND')
     _add_recordings(kinds)
     _add_consistency(kinds)
     _add_lines(kinds)
+    _add_speed(kinds)
 
 
 def _add_recordings(kinds: Any) -> None:
@@ -107,6 +124,25 @@ def _add_lines(kinds: Any) -> None:
     parser.add_argument('directory', type=Path, nargs='?', metavar='DIR', help='a line experiment')
     _add_outputs(parser)
     parser.add_argument('--repeats', type=_positive, default=7, metavar='N', help='turns that count, default 7')
+
+
+def _add_speed(kinds: Any) -> None:
+    parser = kinds.add_parser('speed', help='times by stage, start, memory, growth, live node, against a reference',
+                              description=_SPEED, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('bag', type=Path, nargs='?', default=_CHECKOUT / 'bags' / 'office' / 'bag', metavar='BAG',
+                        help='rosbag2 directory, or a .mcap, .db3 or ROS 1 .bag file; default: the shipped recording')
+    _add_outputs(parser)
+    parser.add_argument('--figures', type=Path, metavar='DIR', help='where plots go; default: with the results')
+    parser.add_argument('--parts', nargs='+', choices=PARTS, default=PARTS, metavar='PART',
+                        help=f'of {", ".join(PARTS)}; default: all')
+    parser.add_argument('--calibration', type=Path, metavar='KALIBR.yaml', help='default: found as in replay')
+    parser.add_argument('--set', action='append', default=[], metavar='NAME=VALUE', help='one parameter')
+    parser.add_argument('--duration', type=float, metavar='S', help='use no more than this much; default: all of it, s')
+    parser.add_argument('--minutes', type=float, default=30.0, metavar='MIN',
+                        help='of data, for the memory; default 30')
+    parser.add_argument('--reference', type=Path, metavar='FILE.json', help='default: that of the repository',
+                        default=_CHECKOUT / 'benchmarks' / 'speed_reference.json')
+    parser.add_argument('--update-reference', action='store_true', help='write the figures there')
 
 
 def _add_outputs(parser: argparse.ArgumentParser) -> None:

@@ -5,6 +5,7 @@ import argparse
 import os
 import sys
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
@@ -16,8 +17,11 @@ from line_slam_ros.benchmark.consistency import World, simulate_all
 from line_slam_ros.benchmark.report import recordings_section
 from line_slam_ros.benchmark.rows import OK, Row, merged, missing_row, read_rows, write_rows
 from line_slam_ros.benchmark.sections import put_section
+from line_slam_ros.benchmark.speed_reference import comparison, read_references, write_reference
 from line_slam_ros.benchmark.suite import chosen, read_suite
+from line_slam_ros.cli.benchmark_parts import Parts, live_module
 from line_slam_ros.cli.benchmark_runs import ONE_THREAD, run_recording
+from line_slam_ros.cli.benchmark_source import Recording
 
 
 def recordings(args: argparse.Namespace) -> int:
@@ -64,6 +68,37 @@ def lines(args: argparse.Namespace) -> int:
     (args.output / 'lines.json').write_text(evaluation.json_text(asdict(speed)), encoding='utf-8')
     _publish(args, 'lines', line_speed.lines_section(speed))
     return 0
+
+
+def speed(args: argparse.Namespace) -> int:
+    """Always 0: what cannot be measured is a ValueError, raised after the parts before it were written."""
+    _prepare(args)
+    recording = Recording(args.bag, args.calibration, tuple(args.set), args.duration)
+    name, figures = recording.name(), args.figures or args.output
+    reference = read_references(args.reference).get(name, {})
+    if args.update_reference and not args.reference.parent.is_dir():
+        raise ValueError(f'{args.reference}: its directory {args.reference.parent} is missing; make it first')
+    if 'live' in args.parts:
+        live_module()
+    figures.mkdir(parents=True, exist_ok=True)
+    parts, found = Parts(recording, figures, lambda file: _link(file, args.markdown or args.output), args.minutes), {}
+    for kind in args.parts:
+        print(f'measuring {kind}', file=sys.stderr, flush=True)
+        part = getattr(parts, kind)()
+        found |= part.figures
+        (args.output / f'{kind}.json').write_text(evaluation.json_text(part.document), encoding='utf-8')
+        _publish(args, f'speed, {kind}', part.section)
+    told = comparison(found, reference)
+    (args.output / 'comparison.md').write_text(told + '\n', encoding='utf-8')
+    print(told)
+    if args.update_reference:
+        write_reference(args.reference, name, found)
+    return 0
+
+
+def _link(file: Path, page: Path) -> str:
+    """A file as a page (or one in that directory) calls it."""
+    return os.path.relpath(file, page if page.is_dir() else page.parent)
 
 
 def _prepare(args: argparse.Namespace) -> None:
