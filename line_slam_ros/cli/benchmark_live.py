@@ -26,8 +26,8 @@ from line_slam_ros.cli.benchmark_runs import IN_ORDER
 from line_slam_ros.cli.benchmark_source import Recording, Source, Tape, in_child, marker_maker, opened
 from line_slam_ros.types import Estimate
 from msg_adapters import outputs, received, sensors
-from msg_adapters.received import diagnosis_values
 from msg_adapters.factories import MessageFactory, ros_messages
+from msg_adapters.received import diagnosis_values
 
 NODE, IMAGE, IMU = '/line_slam', '/benchmark/image', '/benchmark/imu'
 READY_S = 300.0  # for a node that compiles first
