@@ -212,7 +212,7 @@ class SimulatedFrontEnd:
     def __init__(self, lines, T_WC):
         self.lines, self.T_WC, self.forgotten, self.turns = lines, T_WC, [], []
 
-    def track(self, frame, R_CnCp):
+    def track(self, frame, R_CnCp, skip_detection):
         self.turns.append(R_CnCp)
         seen = observed(self.lines, self.T_WC[frame.image[0, 0]], np.random.default_rng(frame.t_ns))
         return Observations(frame.t_ns, PointObservations(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2))),

@@ -19,7 +19,7 @@ class Told:
     def __init__(self):
         self.next, self.gone, self.turns = None, set(), []
 
-    def track(self, frame, R_CnCp):
+    def track(self, frame, R_CnCp, skip_detection):
         self.turns.append(R_CnCp)
         points = self.next.points
         kept = ~np.isin(points.ids, list(self.gone))

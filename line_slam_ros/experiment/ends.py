@@ -64,7 +64,7 @@ def _by_quantile(problem: LineProblem, positions: F64, level: float) -> F64:
 
 
 def _by_vote(problem: LineProblem, pluecker: F64, share: float, sigma: float) -> F64:
-    extents, parallax = np.full((len(pluecker), 2), np.nan), np.empty(len(pluecker))
-    trimming.trim(np.ascontiguousarray(pluecker), problem.padded(problem.poses), problem.padded(problem.ends),
-                  problem.count, FURTHEST, share, sigma, extents, parallax)
-    return extents
+    trimmed, parallax = np.empty((len(pluecker), 2, 3)), np.empty(len(pluecker))
+    trimming.trim(np.arange(len(pluecker)), np.ascontiguousarray(pluecker), problem.padded(problem.poses),
+                  problem.padded(problem.ends), problem.count, FURTHEST, share, sigma, trimmed, parallax)
+    return np.einsum('lej,lj->le', trimmed, pluecker[:, 3:])
