@@ -61,7 +61,7 @@ class Slam:
     def process(self, frame: Frame, imu: ImuBatch, behind: bool = False) -> Estimate | None:
         """One frame and the inertial samples since the previous one; None until initialised and while lost.
 
-        When the caller is behind, nothing new is detected in this frame, which saves time.
+        When the caller is behind, nothing new is detected in this frame unless few tracks are left.
         Raises ValueError for a frame that is not newer than the last, that no inertial sample
         accompanies, or whose size is not the camera's.
         """

@@ -1,6 +1,7 @@
 """Runs every compiled kernel once, so that the first real frame does not wait for a compiler."""
 from __future__ import annotations
 
+import atexit
 import os
 import subprocess
 import sys
@@ -14,9 +15,11 @@ from line_slam_ros.config import Estimator as EstimatorOptions
 from line_slam_ros.estimation.bootstrap import Bootstrap
 from line_slam_ros.estimation.estimator import Estimator
 from line_slam_ros.frontend.front_end import FrontEnd
-from line_slam_ros.geometry.imu import between
+from line_slam_ros.geometry.camera import warm_up_lenses
+from line_slam_ros.geometry.imu import between, turned
 from line_slam_ros.geometry.lie import quaternion_from_matrix
-from line_slam_ros.kernel_cache import cache_is_empty
+from line_slam_ros.geometry.lie_kernels import retract_rotation
+from line_slam_ros.kernel_cache import cache_is_empty, fill
 from line_slam_ros.mapping.line_map import LineMap
 from line_slam_ros.simulation.features import Room, Sequence, Trajectory, calibration
 from line_slam_ros.types import Calibration, Frame
@@ -29,15 +32,20 @@ warm_up.warm_up_estimator(warm_up.EstimatorOptions())"""
 
 def warm_up(front_end: FrontEnd, calibration: Calibration, config: Config, tell: Callable[[str], None]) -> None:
     """Everything. With nothing in the cache this is told, and another process compiles the estimator meanwhile."""
-    beside = None
-    if cache_is_empty(tell) and (os.cpu_count() or 1) > 1:
-        beside = subprocess.Popen([sys.executable, '-c', BESIDE.format(path=sys.path)])
-    LineMap.warm_up(config.mapping)
+    beside, empty = None, cache_is_empty(tell)
     quaternion_from_matrix(np.eye(3))
+    turned(np.array([0.0, 0.1]), np.zeros((2, 3)), np.zeros(3))
+    retract_rotation(np.eye(3), np.zeros(3), np.eye(3))  # what both need, once: numba's cache is made for one writer
+    if empty and len(os.sched_getaffinity(0)) > 1:
+        beside = subprocess.Popen([sys.executable, '-c', BESIDE.format(path=sys.path)])
+        atexit.register(beside.kill)
+    LineMap.warm_up(config.mapping)
+    warm_up_lenses()
     warm_up_front_end(front_end, calibration)
     if beside is not None:
         beside.wait()  # what it could not compile is compiled here, and its error comes up again
     warm_up_estimator(config.estimator)
+    fill()
 
 
 def warm_up_estimator(options: EstimatorOptions) -> None:

@@ -280,7 +280,7 @@ def test_a_node_is_timed_over_dds(profile):
     benchmark_live = benchmark_parts.live_module()
     run = benchmark_live.live(CLIP, profile.motion, 3.0)
     assert 0 <= len(profile.motion.t_ns) - run.images <= 1 and run.rate_hz == pytest.approx(60.0)
-    assert run.seconds == pytest.approx((run.images - 1) / 60.0, abs=0.5) and run.ready_after_s > 0.0
+    assert run.seconds >= (run.images - 1) / 60.0 - 0.05 and run.ready_after_s > 0.0
     assert run.status and run.threads['executor'] >= 0.0 and min(run.rss_mib) > 50.0
     assert len(run.ages_ms) + sum(run.drops.values()) <= run.images + 1
 

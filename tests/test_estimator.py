@@ -11,8 +11,9 @@ from line_slam_ros.estimation import solver as solver_module
 from line_slam_ros.estimation.bootstrap import Bootstrap
 from line_slam_ros.estimation.estimator import Estimator
 from line_slam_ros.estimation.initialisation import upright
-from line_slam_ros.estimation.marginalisation import eliminate
+from line_slam_ros.estimation.marginalisation import drop_state, eliminate
 from line_slam_ros.estimation.stillness import Stillness
+from line_slam_ros.estimation.window import state_row
 from line_slam_ros.geometry.imu import between
 from line_slam_ros.geometry.lie import rigid, so3_exp, so3_log
 from line_slam_ros.simulation.features import GRAVITY_W, Room, Sequence, Trajectory, calibration
@@ -157,6 +158,21 @@ def test_steps_with_jacobians_taken_once_end_where_steps_with_fresh_ones_do(movi
     assert few < 0.75 * many
     assert cost == pytest.approx(exact_cost, rel=1e-4)
     np.testing.assert_allclose(p, exact_p, atol=2e-4)
+
+
+def test_a_state_that_the_prior_knows_can_be_dropped(moving):
+    """Its part of the prior is passed on to the others, and nothing else is."""
+    estimator, _, _, _, _ = run(moving)
+    w = estimator.window
+    slot = int(np.flatnonzero(w.frozen[:w.n])[-1])
+    own = slice(state_row(slot), state_row(slot + 1))
+    others = np.setdiff1d(np.arange(w.rows), np.arange(own.start, own.stop))
+    expected, _ = eliminate(w.prior_H[:w.rows, :w.rows], w.prior_g[:w.rows], np.arange(own.start, own.stop), others)
+    points = w.points.count
+    assert slot and w.prior_H[own, own].any()
+    drop_state(estimator.solver, slot)
+    np.testing.assert_allclose(w.prior_H[:w.rows, :w.rows], expected, rtol=1e-9, atol=1e-6)
+    assert w.points.count == points
 
 
 def test_eliminating_a_state_leaves_the_solution_of_the_others():

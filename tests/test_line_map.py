@@ -157,6 +157,16 @@ def test_doubtful_lines_are_neither_shown_nor_kept(rng, change):
     assert len(line_map.segments()) == 0
 
 
+def test_a_line_of_unknown_uncertainty_is_neither_shown_nor_kept(rng):
+    line_map = LineMap(Mapping())
+    add(line_map, rng, 0, A, B)
+    assert len(line_map.active()) == 1
+    line_map.refine(np.array([0]), pluecker_through(A, B)[None], np.full((1, 6, 6), np.nan), np.array([12]))
+    assert len(line_map.active()) == 0
+    line_map.retire(np.array([0]))
+    assert len(line_map.segments()) == 0
+
+
 def test_a_line_without_parallax_is_not_shown(rng):
     line_map = LineMap(Mapping())
     line_map.refine(np.array([0]), pluecker_through(A, B)[None], covariance(A, B, 1e-3)[None], np.array([9]))

@@ -112,10 +112,11 @@ def test_saving_where_nobody_can_write_is_refused_with_a_reason(node: Process, p
     from rclpy.parameter import Parameter
     from rclpy.parameter_client import AsyncParameterClient
     client = AsyncParameterClient(peer.node, '/line_slam')
-    future = client.set_parameters([Parameter('node.map_path', value='/proc/nowhere/map')])
-    assert peer.spin_until(future.done, 10.0) and future.result().results[0].successful
-    reply = peer.call('/line_slam/save_map')
-    assert not reply.success and '/proc/nowhere/map' in reply.message
+    for path, reason in (('/proc/nowhere/map', '/proc/nowhere/map'), ('~nosuchuser/map', 'home')):
+        future = client.set_parameters([Parameter('node.map_path', value=path)])
+        assert peer.spin_until(future.done, 10.0) and future.result().results[0].successful
+        reply = peer.call('/line_slam/save_map')
+        assert not reply.success and reason in reply.message
 
 
 @pytest.mark.parametrize('when', ['loading compiled code', 'ready for data'])

@@ -22,7 +22,21 @@ def test_a_dead_worker_takes_the_node_down(ros: None, monkeypatch: pytest.Monkey
     monkeypatch.setattr(Inputs, '_read_files', lambda _: None)  # no complaint about the missing calibration
     node = line_slam_node.LineSlamNode()
     line_slam_node.spin(node)
-    assert node.worker_failed
+    assert node.thread_failed
+
+
+@pytest.mark.filterwarnings('ignore::pytest.PytestUnhandledThreadExceptionWarning')
+def test_a_dead_poller_takes_the_node_down(ros: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(line_slam_node.LineSlamNode, '_work', lambda _: None)
+    monkeypatch.setattr(Inputs, '_read_files', lambda _: None)
+    node = line_slam_node.LineSlamNode()
+
+    def die() -> None:
+        raise RuntimeError('a bug')
+
+    node._saving._serve = die
+    line_slam_node.spin(node)
+    assert node.thread_failed
 
 
 def test_waiting_frames_hurry_the_worker_before_any_is_dropped(ros: None, monkeypatch: pytest.MonkeyPatch) -> None:

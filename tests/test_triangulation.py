@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from line_slam_ros.estimation.line_start import start_from_planes
-from line_slam_ros.estimation.triangulation import give_up_near, start_lines
+from line_slam_ros.estimation.triangulation import lines_in_cameras, start_lines
 from line_slam_ros.geometry.lie import rigid, so3_exp
 from line_slam_ros.geometry.line_forms import VALUES, store_lines, unit_world_lines
 from line_slam_ros.geometry.lines import point_distance
@@ -70,14 +70,15 @@ def test_parallax_beyond_the_noise_starts_lines_near_the_true_ones(start):
     assert np.median(error) < 0.1
 
 
-def test_a_line_within_a_camera_that_sees_it_is_given_up():
+def test_a_line_within_a_camera_that_sees_it_is_found():
     """Line 0 ends a millimetre from camera 1, line 1 three centimetres from one that does not see it, 2 is far off."""
     positions = np.arange(VIEWS)[:, None] * [0.5, 0.0, 0.0]
     feet = positions[1] + np.array([[0.0, 1e-3, 0.0], [0.0, 0.03, 0.0], [0.0, 0.2, 0.0]])
     pluecker = np.concatenate([np.cross(feet, [0.0, 0.0, 1.0]), np.tile([0.0, 0.0, 1.0], (3, 1))], axis=1)
-    values, solved, views = np.zeros((3, VALUES)), np.zeros(3, bool), np.ones((3, VIEWS), bool)
+    values, views = np.zeros((3, VALUES)), np.ones((3, VIEWS), bool)
+    solved, inside = np.zeros(3, bool), np.zeros(3, bool)
     store_lines(FORM, pluecker, np.tile(np.eye(3), (3, 1, 1)), np.zeros((3, 2, 2)), values, solved)
     views[1, 1] = False
-    give_up_near(VIEWS, np.tile(np.eye(3), (VIEWS, 1, 1)), positions, np.eye(3), np.zeros(3), solved, views, FORM,
-                 values, np.zeros((3, 3)))
-    assert solved.tolist() == [False, True, True]
+    lines_in_cameras(VIEWS, np.tile(np.eye(3), (VIEWS, 1, 1)), positions, np.eye(3), np.zeros(3), solved, views, FORM,
+                     values, np.zeros((3, 3)), inside)
+    assert inside.tolist() == [True, False, False]

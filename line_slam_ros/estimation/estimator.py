@@ -10,7 +10,7 @@ from line_slam_ros.estimation.initialisation import Snapshot, Start
 from line_slam_ros.estimation.marginalisation import drop_state, marginalise_oldest
 from line_slam_ros.estimation.shift import FEW_CORNERS, corner_shifts, segment_shifts
 from line_slam_ros.estimation.solver import LEAST_DAMPING, Solver, SolverOptions
-from line_slam_ros.estimation.triangulation import give_up_near, start_lines, start_points
+from line_slam_ros.estimation.triangulation import lines_in_cameras, start_lines, start_points
 from line_slam_ros.estimation.window import RIG, Window, state_row
 from line_slam_ros.geometry.lie import rigid
 from line_slam_ros.geometry.line_forms import unit_world_lines
@@ -210,9 +210,9 @@ class Estimator:
                     int(o.line_form), q.values, q.origin, q.solved)
 
     def _cull(self) -> tuple[I64, I64]:
-        """Landmarks whose newest view fails the chi-square gate lose it; those mostly wrong go for good.
+        """Landmarks whose newest view fails the chi-square gate lose it.
 
-        Lines that fell into a camera that sees them start anew.
+        Those mostly wrong go for good, and so do lines that fell into a camera that sees them.
         """
         w, n = self.window, self.window.n
         gate, gone = self.options.gate_chi2, []
@@ -226,9 +226,11 @@ class Estimator:
             gone.append(table.ids[:c][dead].copy())
             table.keep(~dead)
         R, position = self.solver.exposed()
-        q = w.lines
-        give_up_near(n, R, position, w.R_BC, w.p_BC, q.solved[:q.count], q.seen, int(self.solver.options.line_form),
-                     q.values, q.origin)
+        q, inside = w.lines, np.zeros(w.lines.count, np.bool_)
+        lines_in_cameras(n, R, position, w.R_BC, w.p_BC, q.solved[:q.count], q.seen, int(self.solver.options.line_form),
+                         q.values, q.origin, inside)
+        gone[1] = np.concatenate([gone[1], q.ids[:q.count][inside]])
+        q.keep(~inside)
         return gone[0], gone[1]
 
     def _forget_ended(self) -> None:

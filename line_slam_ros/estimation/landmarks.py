@@ -187,7 +187,7 @@ def _tie(i, f, d, J, at, by_land, L, first, S):
 def eliminate(use, d, damping, L, first, S):
     """Factor the landmarks' Hessians, diagonals times 1 + damping, in place, and turn their rows of S into L^-1 W.
 
-    A landmark whose Hessian is singular says nothing: its rows become zero, and its step will.
+    A landmark whose Hessian is singular stays where it is: its rows become zero, and its step will.
     """
     for i in range(len(use)):
         if not use[i]:

@@ -12,7 +12,7 @@ from line_slam_ros.config import Config
 from line_slam_ros.estimation.line_solver import refine_lines
 from line_slam_ros.estimation.line_start import start_from_planes
 from line_slam_ros.frontend.front_end import FrontEnd
-from line_slam_ros.geometry.camera import Camera
+from line_slam_ros.geometry.camera import Camera, warm_up_lenses
 from line_slam_ros.geometry.lie import rigid
 from line_slam_ros.geometry.line_forms import VALUES, store_lines
 from line_slam_ros.kernel_cache import cache_is_empty
@@ -54,6 +54,7 @@ class LineMapper:
     def warm_up(self, tell: Callable[[str], None] = print) -> None:
         """Compile or load every kernel; tell is called with a sentence for the human when it takes long."""
         cache_is_empty(tell)
+        warm_up_lenses()
         LineMap.warm_up(self._config.mapping)
         LineEstimator.warm_up(self._config)
         scratch = FrontEnd(Camera(self._calibration), replace(self._config, use_points=False, use_lines=True))
@@ -66,7 +67,7 @@ class LineMapper:
     def process_with_pose(self, frame: Frame, T_WB: F64, behind: bool = False) -> Estimate:
         """One frame and the body's pose (4, 4) when it was taken. The estimate repeats the pose.
 
-        When the caller is behind, nothing new is detected in this frame, which saves time.
+        When the caller is behind, nothing new is detected in this frame unless few tracks are left.
         Raises ValueError for a frame that is not newer than the last and for a pose that is not finite.
         """
         if self._last is not None and frame.t_ns <= self._last[0]:

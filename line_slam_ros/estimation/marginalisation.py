@@ -28,8 +28,8 @@ def drop_state(solver: Solver, slot: int) -> None:
     window = solver.window
     own = slice(state_row(slot), state_row(slot + 1))
     if np.any(window.prior_H[own, own]):
-        none = np.zeros(0, np.bool_)
-        _into_prior(solver, slot, none, none, NO_LINKS)
+        none = (np.zeros(table.count, np.bool_) for table in (window.points, window.lines))
+        _into_prior(solver, slot, *none, NO_LINKS)
     window.remove(slot)
 
 

@@ -26,6 +26,7 @@ from line_slam_ros.estimation.landmarks import (
     retract_landmarks,
     spread,
 )
+from line_slam_ros.estimation.rest import add_rest, add_rest_gradient, rest_cost
 from line_slam_ros.estimation.window import POSE, RIG, STATE, Window, state_row
 from line_slam_ros.factors.imu_factor import imu_jacobians, imu_residual
 from line_slam_ros.geometry.lie_kernels import retract_rotation
@@ -130,8 +131,6 @@ class SolverOptions:
     line_form: LineForm = LineForm.ORTHONORMAL
     rho0: float = 0.3  # 1/m, where points without parallax are believed to be
     w_rho: float = 0.03  # m, weight of that belief: thousands of points must not add up to a belief in scale
-    still_speed: float = 0.01  # m/s, how still a body at rest is
-    still_shift: float = 1e-3  # m, and how far it may move between two states at rest
 
 
 class _Landmarks:
@@ -196,7 +195,7 @@ class Solver:
         p, q, kp, kl = w.points, w.lines, self.points, self.lines
         self._expose()
         d = w.delta(self._delta)
-        return (float(d @ (0.5 * (w.prior_H @ d) + w.prior_g)) + self._rest_cost() + self.inertial_cost()
+        return (float(d @ (0.5 * (w.prior_H @ d) + w.prior_g)) + rest_cost(w) + self.inertial_cost()
                 + point_residuals(w.n, self._R, self._p, w.R_BC, w.p_BC, kp.use, p.seen, p.z, p.sigma, p.abr, p.R_WA,
                                   p.p_WA, o.point_c2, o.rho0, o.w_rho, kp.chi2, kp.pull, kp.weight, kp.a)
                 + line_residuals(w.n, self._R, self._p, w.R_BC, w.p_BC, kl.use, q.seen, q.z, q.sigma, int(o.line_form),
@@ -213,7 +212,7 @@ class Solver:
         self.H[:] = w.prior_H
         add_link_hessians(*self._links, w.R0, w.p0, w.v0, w.b0, w.dt, w.dR, w.dp, w.dv, w.J_b, w.b_lin, w.W, w.w_b,
                           o.g_W, self._link_J, self.H)
-        self._add_rest()
+        add_rest(w, self._links, self.H)
         exposures(n, w.R0, w.p0, w.v, w.rates, w.delay[0], self._R0, self._p0, self._twist)
         S = self._S[:self._rows, :column(n)]
         S[:], self._count[:] = 0.0, 0
@@ -234,7 +233,7 @@ class Solver:
         w, n = self.window, self.window.n
         self.g[:] = w.prior_g + w.prior_H @ w.delta(self._delta)
         add_link_gradients(*self._links, self._link_J, self._link_r, self.g)
-        self._add_rest_gradient()
+        add_rest_gradient(w, self._links, self.g)
         own = np.zeros((n, LANES))
         for kind in (self.points, self.lines):
             gradients(n, kind.use, kind.size, kind.pull, kind.at, kind.undo, kind.by_land, kind.L, kind.a, kind.first,
@@ -252,48 +251,6 @@ class Solver:
         """R_WB (n, 3, 3) and p_WB (n, 3) when the images of the window were taken."""
         self._expose()
         return self._R[:self.window.n], self._p[:self.window.n]
-
-    def _resting(self) -> tuple[np.ndarray, np.ndarray]:
-        """Which states are at rest and have no velocity; which links between two of them have no length."""
-        n, (first, last) = self.window.n, self._links
-        still = self.window.still[first:n if last == n - 1 else last]
-        both = self.window.still[first:last] & self.window.still[first + 1:last + 1]
-        return first + np.flatnonzero(still), first + np.flatnonzero(both)
-
-    def _add_rest(self) -> None:
-        if not self.window.still.any():
-            return
-        states, links = self._resting()
-        speed, shift = np.eye(3) / self.options.still_speed**2, np.eye(3) / self.options.still_shift**2
-        for k in states:
-            v = _part(k, 6)
-            self.H[v, v] += speed
-        for k in links:
-            a, b = _part(k, 3), _part(k + 1, 3)
-            self.H[a, a] += shift
-            self.H[b, b] += shift
-            self.H[a, b] -= shift
-            self.H[b, a] -= shift
-
-    def _add_rest_gradient(self) -> None:
-        w = self.window
-        if not w.still.any():
-            return
-        states, links = self._resting()
-        for k in states:
-            self.g[_part(k, 6)] += w.v[k] / self.options.still_speed**2
-        for k in links:
-            shift = (w.p[k + 1] - w.p[k]) / self.options.still_shift**2
-            self.g[_part(k, 3)] -= shift
-            self.g[_part(k + 1, 3)] += shift
-
-    def _rest_cost(self) -> float:
-        w, o, n = self.window, self.options, self.window.n
-        if not w.still.any():
-            return 0.0
-        both = w.still[:n - 1] & w.still[1:n]
-        return 0.5 * float(np.sum((w.v[:n][w.still[:n]] / o.still_speed) ** 2)
-                           + np.sum((np.diff(w.p[:n], axis=0)[both] / o.still_shift) ** 2))
 
     def cost(self) -> float:
         """Present robust cost; refreshes points.chi2 and lines.chi2 (rows, slots)."""
@@ -397,11 +354,6 @@ class Solver:
         inverse = np.linalg.inv(self.lines.L[lines]).transpose(0, 2, 1)
         AW = inverse @ S
         return inverse @ inverse.transpose(0, 2, 1) + AW @ C @ AW.transpose(0, 2, 1)
-
-
-def _part(slot: int, first: int) -> slice:
-    """Three rows of a slot's state."""
-    return slice(state_row(slot) + first, state_row(slot) + first + 3)
 
 
 def _hold(H: F64, rows: np.ndarray) -> None:

@@ -161,8 +161,8 @@ def _in_front(n, R, p, R_BC, p_BC, seen, z, nd, origin):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def give_up_near(n, R, p, R_BC, p_BC, solved, seen, form, values, origin):
-    """Lines nearer than NEAREST to a camera that saw them have no estimate any more: solved (M,) becomes False.
+def lines_in_cameras(n, R, p, R_BC, p_BC, solved, seen, form, values, origin, inside):
+    """Mark in inside (M,) the solved lines that are nearer than NEAREST to a camera that saw them.
 
     Every segment agrees with a line through the camera's centre, so a line with little parallax can fall into it, and
     seems more and more certain the nearer it comes.
@@ -181,4 +181,4 @@ def give_up_near(n, R, p, R_BC, p_BC, solved, seen, form, values, origin):
             m1 = n_W[1] - (p_WC[2] * d_W[0] - p_WC[0] * d_W[2])
             m2 = n_W[2] - (p_WC[0] * d_W[1] - p_WC[1] * d_W[0])
             if not m0 * m0 + m1 * m1 + m2 * m2 > NEAREST * NEAREST * length2:
-                solved[i] = False
+                inside[i] = True

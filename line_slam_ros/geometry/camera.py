@@ -278,3 +278,10 @@ def _check(calibration: Calibration) -> None:
     if not min(calibration.width, calibration.height) > 0:
         raise ValueError(f'image size must be positive, got {calibration.width} x {calibration.height} px: '
                          'set the width and height of the calibration')
+
+
+def warm_up_lenses() -> None:
+    """Compile or load the kernels of every lens: that of the camera may be known only later."""
+    for model, size in ((_Radtan, 5), (_Equidistant, 4)):
+        lens = model(np.zeros(size))
+        lens.undistort(lens.distort(np.zeros((1, 2))))

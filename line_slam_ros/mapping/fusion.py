@@ -75,7 +75,7 @@ def _worst_sigma(pluecker, cov, ends):
     for k in range(2):
         offsets(pluecker, cov, ends[k:k + 1], axes, mean, across)
         difference = np.sqrt((across[0, 0] - across[1, 1]) ** 2 + 4.0 * across[0, 1] ** 2)
-        worst = max(worst, 0.5 * (across[0, 0] + across[1, 1] + difference))  # the larger eigenvalue
+        worst = np.maximum(worst, 0.5 * (across[0, 0] + across[1, 1] + difference))  # the larger one; NaN stays NaN
     return np.sqrt(worst)
 
 

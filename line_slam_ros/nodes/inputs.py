@@ -76,6 +76,11 @@ class Inputs:
             quiet = {name: s for name, s in quiet.items() if name not in ('pose', 'odometry')}
         return [s.silence(self._node.count_publishers(s.topic)) for s in quiet.values()]
 
+    @property
+    def failed(self) -> bool:
+        """Whether the thread that takes IMU data has ended by an exception."""
+        return self._poller is not None and self._poller.died
+
     def _listen(self, name: str, topic: str, kind: type, what: str, callback: Callable[[Any], None],
                 polled: bool = False) -> None:
         """A polled topic's messages are handed over serialised, past the executor."""

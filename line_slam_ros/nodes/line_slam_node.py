@@ -36,7 +36,7 @@ from line_slam_ros.types import Calibration, Estimate, ImuBatch, LineSegments
 
 RCLError = rclpy_implementation.RCLError
 SWITCH_INTERVAL_S = 5e-4  # how long the worker may keep the executor waiting; Python's 5 ms cost IMU latency
-SAVING_PAUSE_S = 4e-3  # between rows of a map that is saved, for the worker to go on
+SAVING_PAUSE_S = 4e-3  # between blocks of rows of a map that is saved, for the worker to go on
 BEHIND = 2  # frames that wait for the worker before it hurries; one is jitter
 WARM_UP_CALIBRATION = Calibration('radtan', 752, 480, (450.0, 450.0, 376.0, 240.0), (0.0, 0.0, 0.0, 0.0), np.eye(4))
 
@@ -54,7 +54,7 @@ class LineSlamNode(Node):
         self._map_version: int | None = None
         self._newest_ns = 0
         self._stopping = False
-        self.worker_failed = False
+        self.thread_failed = False
         self._outgoing = Publishers(self, self._shell)
         self._incoming = Inputs(self, self._shell, self._calibrations.put)
         self._diagnostics = Diagnostics(self, self._incoming, self._shell)
@@ -93,8 +93,8 @@ class LineSlamNode(Node):
             if self.context.ok():  # else: shut down in the middle of a publish
                 raise
         finally:
-            self.worker_failed = not self._stopping and self.context.ok()
-            if self.worker_failed:
+            self.thread_failed = not self._stopping and self.context.ok()
+            if self.thread_failed:
                 self.context.try_shutdown()
 
     def _warm_up(self) -> None:
@@ -165,6 +165,10 @@ class LineSlamNode(Node):
             self._send_lines(LineSegments.empty(), LineSegments.empty())
 
     def _every_second(self) -> None:
+        if self._saving.died or self._incoming.failed:  # as with the worker: what cannot go on ends, with a traceback
+            self.thread_failed = True
+            self.context.try_shutdown()
+            return
         for note in self._incoming.inbox.notes():
             self.get_logger().warning(note)
             self._diagnostics.remember(note)
@@ -189,11 +193,11 @@ class LineSlamNode(Node):
         return response
 
     def _on_save_map(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        path = Path(self.get_parameter('node.map_path').value).expanduser().absolute()
         try:
-            response.message = self._save_map(path)
+            path = Path(self.get_parameter('node.map_path').value).expanduser()
+            response.message = self._save_map(path.absolute())
             response.success = True
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: the home of nobody
             response.message = f'map not saved: {error}'
         return response
 
@@ -220,7 +224,7 @@ def main(args: Sequence[str] | None = None) -> int:
         rclpy.try_shutdown()
         return 1
     spin(node)
-    return int(node.worker_failed)
+    return int(node.thread_failed)
 
 
 def spin(node: LineSlamNode) -> None:

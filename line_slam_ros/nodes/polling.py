@@ -36,7 +36,7 @@ class Poller:
 
     def __init__(self, serve: Callable[[], None], period_s: float) -> None:
         self._serve, self._period_s = serve, period_s
-        self._ended = threading.Event()
+        self._ended, self._over = threading.Event(), False
         self._thread = threading.Thread(target=self._run, name='poller', daemon=True)
         self._thread.start()
 
@@ -63,11 +63,17 @@ class Poller:
     def stop(self) -> None:
         """Ends the thread; a subscription or service that is destroyed first ends it, too."""
         self._ended.set()
-        self._thread.join()
+        self._thread.join(timeout=5.0)  # it may be saving a large map; the thread is a daemon
+
+    @property
+    def died(self) -> bool:
+        """Whether an exception ended the thread."""
+        return not self._over and not self._thread.is_alive()
 
     def _run(self) -> None:
-        while not self._ended.wait(self._period_s):
-            try:
+        try:
+            while not self._ended.wait(self._period_s):
                 self._serve()
-            except InvalidHandle:
-                return
+        except InvalidHandle:
+            pass
+        self._over = True
