@@ -6,6 +6,7 @@ one more saves the map, which takes seconds.
 from __future__ import annotations
 
 import gc
+import signal
 import sys
 import threading
 import time
@@ -216,6 +217,7 @@ def main(args: Sequence[str] | None = None) -> int:
     """Entry point; 0 after SIGINT or SIGTERM, 1 when parameters are unusable or the worker died."""
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     cv2.setNumThreads(1)  # as replay; the other core is for the executor
+    signal.signal(signal.SIGINT, lambda *_: None)  # rclpy ends the executor; Python's exception could hit it anywhere
     rclpy.init(args=args)
     try:
         node = LineSlamNode()
@@ -234,7 +236,7 @@ def spin(node: LineSlamNode) -> None:
     node.start()
     try:
         executor.spin()
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except ExternalShutdownException:
         pass
     except RCLError:  # a signal in the middle of waiting
         if rclpy.ok():
