@@ -164,6 +164,8 @@ class Slam:
 
     def _drop(self, line_ids: I64) -> None:
         """Lines that turned out wrong never reach the map."""
+        if not len(line_ids):
+            return
         wrong = np.intersect1d(line_ids, self._mapped)
         self.line_map.drop(wrong)
         self._mapped = np.setdiff1d(self._mapped, wrong)

@@ -48,8 +48,8 @@ def rest_cost(window: Window) -> float:
 
 def _resting(window: Window, links: tuple[int, int]) -> tuple[list[int], list[int]]:
     """Slots at rest, and the first ones of links between two of them."""
-    still, n, (first, last) = window.still[:window.n].tolist(), window.n, links
-    if not any(still):
+    still, n, (first, last) = window.still[:window.n], window.n, links
+    if not still.any():
         return [], []
     return ([k for k in range(first, n if last == n - 1 else last) if still[k]],
             [k for k in range(first, last) if still[k] and still[k + 1]])

@@ -35,7 +35,8 @@ from line_slam_ros.types import F64, LineForm
 TRACE = 1e-9  # information that holds what nothing says anything about
 TRUSTED = 0.5  # of the predicted change of the cost: a smaller error, and the Jacobians serve for another step
 LEAST_DAMPING = 1e-9  # too small to matter
-CONVERGED = 1.0  # change of the cost (half squared standard deviations) below which iterating ends
+CONVERGED = 3.0  # change of the cost (half squared standard deviations) below which iterating ends: of some 200 numbers
+# together, a sixth of a standard deviation each
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
