@@ -6,9 +6,10 @@ from unittest import mock
 import numpy as np
 import pytest
 
+from line_slam_ros.benchmark.consistency import World, simulate
 from line_slam_ros.config import Estimator as Options
 from line_slam_ros.estimation import solver as solver_module
-from line_slam_ros.estimation.bootstrap import Bootstrap
+from line_slam_ros.estimation.bootstrap import MAX_UNSETTLED, Bootstrap
 from line_slam_ros.estimation.estimator import Estimator
 from line_slam_ros.estimation.initialisation import upright
 from line_slam_ros.estimation.marginalisation import drop_state, eliminate
@@ -158,6 +159,26 @@ def test_steps_with_jacobians_taken_once_end_where_steps_with_fresh_ones_do(movi
     assert few < 0.75 * many
     assert cost == pytest.approx(exact_cost, rel=1e-4)
     np.testing.assert_allclose(p, exact_p, atol=2e-4)
+
+
+def test_an_estimate_that_another_step_would_change_is_unsettled(moving):
+    """Which is what a start is refused for."""
+    estimator, _, _, _, _ = run(moving)
+    estimator.solver.optimise(30)
+    estimator.linearise()
+    assert 0.0 <= estimator.solver.unsettled() < 3.0
+    w = estimator.window
+    w.p[:w.n] *= 0.9  # a wrong scale
+    estimator.linearise()
+    assert estimator.solver.unsettled() > MAX_UNSETTLED
+
+
+def test_a_start_reaches_the_right_scale_through_a_flat_valley():
+    """Noise of a pixel and little acceleration: undamped steps overshoot, and damped ones creep."""
+    world = World(18, 3.0, 1.0, False, 'room', 600, 700)
+    trace = simulate(world)
+    moved, true = (np.linalg.norm(T[-1][:3, 3] - T[0][:3, 3]) for T in (trace.T_EB, trace.true_T_EB))
+    assert moved == pytest.approx(true, rel=0.05)
 
 
 def test_a_state_that_the_prior_knows_can_be_dropped(moving):

@@ -17,6 +17,7 @@ MIN_PARALLAX_PX = 15.0  # median shift, rotation included, between first and las
 MIN_VIEWS = 4  # of a corner that says something about the quality of a start
 MAX_CHI2 = 4.0  # median squared whitened residual of a refined start; 1.4 when the noise model is right
 MAX_INERTIAL_CHI2 = 2.5  # mean squared whitened inertial residual; 1 when right, tens at a wrong scale
+MAX_UNSETTLED = 10.0  # half squared standard deviations that another step would gain: more, and it is no minimum
 
 
 class Bootstrap:
@@ -115,7 +116,7 @@ class Bootstrap:
         R = so3_exp(np.array([0.0, 0.0, heading]))
         placed = Start(R @ start.R_WB, start.p_W @ R.T + position, start.v_W @ R.T, start.gyro_bias)
         self._estimator.begin(placed, shots, still)
-        self._estimator.refine(1 if still else 4)
+        self._estimator.refine(1 if still else 8)
 
     def _refuse(self) -> str:
         """Why a refined start from motion is not good enough, or ''."""
@@ -133,6 +134,8 @@ class Bootstrap:
             return 'a plausible accelerometer bias: accelerate the camera in several directions'
         moved = w.p[w.n - 1] - w.p[0]
         e.linearise()
+        if e.solver.unsettled() > MAX_UNSETTLED:
+            return 'metric scale: a first estimate that settles, accelerate the camera'
         cov = e.solver.covariance()[3:6, 3:6]
         distance = max(float(np.linalg.norm(moved)), 1e-9)
         sigma = float(np.sqrt(moved @ cov @ moved)) / distance**2

@@ -9,7 +9,7 @@ from line_slam_ros.config import Estimator as Options
 from line_slam_ros.estimation.initialisation import Snapshot, Start
 from line_slam_ros.estimation.marginalisation import drop_state, marginalise_oldest
 from line_slam_ros.estimation.shift import FEW_CORNERS, corner_shifts, segment_shifts
-from line_slam_ros.estimation.solver import LEAST_DAMPING, Solver, SolverOptions
+from line_slam_ros.estimation.solver import CONVERGED, LEAST_DAMPING, Solver, SolverOptions
 from line_slam_ros.estimation.triangulation import lines_in_cameras, start_lines, start_points
 from line_slam_ros.estimation.window import RIG, Window, state_row
 from line_slam_ros.geometry.lie import rigid
@@ -79,13 +79,16 @@ class Estimator:
         self._triangulate()
 
     def refine(self, rounds: int) -> float:
-        """Optimise a freshly filled window, relinearising everything between rounds. Returns the final cost."""
-        w = self.window
+        """Optimise a freshly filled window, relinearising everything between rounds, at most so many, until the cost
+        settles. Returns the final cost."""
+        w, cost = self.window, np.inf
         for _ in range(rounds):
-            self.solver.optimise(5)
+            before, cost = cost, self.solver.optimise(10)
             w.recentre_prior()
             for k in range(w.n - 1):
                 w.integrate(k)
+            if abs(before - cost) < CONVERGED:
+                break
         return self.solver.cost()
 
     def linearise(self) -> None:

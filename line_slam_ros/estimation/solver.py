@@ -277,7 +277,7 @@ class Solver:
             before = self._save()
             predicted = self._step()
             new_cost = self._evaluate() if predicted > 0.0 else np.inf
-            gain = cost - new_cost
+            gain, damped = cost - new_cost, self.linearised_with > LEAST_DAMPING  # what is damped may still be far off
             trusted = abs(gain - predicted) < TRUSTED * predicted
             if gain > 0.0:
                 cost, damping = new_cost, max(0.1 * damping, LEAST_DAMPING)
@@ -285,9 +285,17 @@ class Solver:
                 self._restore(before)
                 self._evaluate()
                 damping = min(max(10.0 * damping, 1e-4), 1e4) if fresh else damping
-            if min(abs(gain), predicted or np.inf) < CONVERGED:
+            if min(abs(gain), predicted or np.inf) < CONVERGED and not damped:
                 break
         return cost
+
+    def unsettled(self) -> float:
+        """By how much the cost would fall by the equations linearised last; infinity if they have no solution."""
+        factor, rows = self._factored(), self.window.rows
+        if not len(factor):
+            return np.inf
+        s = self._s[:self._rows]
+        return 0.5 * float(s @ s + self.g[:rows] @ _solve(factor, self.g[:rows]))
 
     def _factored(self) -> F64:
         """Of the equations; empty when they have no solution."""
