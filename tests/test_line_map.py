@@ -148,21 +148,11 @@ def test_ends_follow_a_refined_estimate(rng):
     assert (ends[1] - ends[0]) @ (B - A) > 0  # a direction turned round by the estimator does not swap the ends
 
 
-@pytest.mark.parametrize('change', [{'sigma': 0.2}, {'count': 3}, {'part': lambda k: (0.5, 0.51)}])
+@pytest.mark.parametrize('change', [{'sigma': 0.2}, {'sigma': np.nan}, {'count': 3}, {'part': lambda k: (0.5, 0.51)}])
 def test_doubtful_lines_are_neither_shown_nor_kept(rng, change):
     line_map = LineMap(Mapping())
     add(line_map, rng, 0, A, B, **change)
     assert len(line_map.active()) == len(line_map.segments()) == 0
-    line_map.retire(np.array([0]))
-    assert len(line_map.segments()) == 0
-
-
-def test_a_line_of_unknown_uncertainty_is_neither_shown_nor_kept(rng):
-    line_map = LineMap(Mapping())
-    add(line_map, rng, 0, A, B)
-    assert len(line_map.active()) == 1
-    line_map.refine(np.array([0]), pluecker_through(A, B)[None], np.full((1, 6, 6), np.nan), np.array([12]))
-    assert len(line_map.active()) == 0
     line_map.retire(np.array([0]))
     assert len(line_map.segments()) == 0
 

@@ -15,6 +15,7 @@ import message_samples
 import rclpy
 from ros_harness import OFFICE_ARGS, OFFICE_BAG, OFFICE_CALIBRATION, Peer, Process, slam_node
 
+from line_slam_ros.cli import playing
 from line_slam_ros.cli.bag_reader import open_bag
 from line_slam_ros.cli.bag_writer import BagWriter
 from line_slam_ros.mapping.io import read_csv
@@ -85,6 +86,19 @@ def test_nobody_listens(ros_domain: int, still_bag: Path, tmp_path: Path) -> Non
     process = play(tmp_path / 'log', still_bag, '--wait', 0.5)
     assert process.wait() == 1
     assert 'nobody subscribes to ' in process.text and 'start line_slam_node' in process.text
+
+
+def test_a_player_that_was_held_up_makes_no_burst(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = 100.0
+    monkeypatch.setattr(playing.time, 'monotonic', lambda: clock)
+    log = [('image', 50_000_000 * k, b'') for k in range(60)]
+    dues = []
+    for due, _, t_ns, _ in playing.schedule(log, 0.5, 2.0, 2.0):
+        dues.append(due)
+        clock = max(clock, due) + (3.0 if t_ns == 1_000_000_000 else 0.0)  # held up once, when the first 11 are out
+    assert len(dues) == 41
+    np.testing.assert_allclose(dues[:11], 100.0 + 0.025 * np.arange(11))
+    np.testing.assert_allclose(dues[11:], 103.25 - 0.1 + 0.025 * np.arange(30))
 
 
 @pytest.mark.parametrize('arguments,complaint', [
@@ -166,7 +180,7 @@ def test_live_poses_are_those_of_the_offline_replay(live: Live, tmp_path: Path) 
     assert code == 0, out + errors
     offline, online = (np.loadtxt(d / 'trajectory.tum') for d in (tmp_path / 'replay', live.directory))
     common, i, j = np.intersect1d(offline[:, 0], online[:, 0], return_indices=True)
-    assert 0.5 * len(offline) <= len(common) and len(online) > 20, live.node  # a busy machine drops some
+    assert 0.9 * len(offline) <= len(common) and len(online) > 20, live.node
     assert np.linalg.norm(offline[i, 1:4] - online[j, 1:4], axis=1).mean() < 0.02  # m, as the issue demands
 
 

@@ -1,6 +1,7 @@
 """What a running node did: age of its poses, drops, CPU time of its threads."""
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from line_slam_ros.benchmark.sections import number, table
 from line_slam_ros.benchmark.speed_stages import QUANTILES, quantiles
 
 SMALL_SHARE = 0.005  # threads that use less of a core are told together
-TICK_S = 0.01  # of the CPU times in /proc
+TICK_S = 1.0 / os.sysconf('SC_CLK_TCK')  # of the CPU times in /proc
 
 EXPLANATION = """\
 `line_slam_node` in a process of its own, the player in another, DDS on this machine; images and inertial data are

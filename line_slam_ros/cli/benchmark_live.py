@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -23,11 +23,10 @@ from line_slam_ros.benchmark.speed_live import Live, MessageCost, thread_shares,
 from line_slam_ros.benchmark.speed_memory import resident_mib
 from line_slam_ros.benchmark.speed_motion import Faster, Motion, frames_within, sample_rate, showing
 from line_slam_ros.cli.benchmark_runs import IN_ORDER
-from line_slam_ros.cli.benchmark_source import Recording, Source, Tape, in_child, marker_maker, opened
+from line_slam_ros.cli.benchmark_source import Recording, Source, Tape, environment, in_child, marker_maker, opened
 from line_slam_ros.types import Estimate
 from msg_adapters import outputs, received, sensors
 from msg_adapters.factories import MessageFactory, ros_messages
-from msg_adapters.received import diagnosis_values
 
 NODE, IMAGE, IMU = '/line_slam', '/benchmark/image', '/benchmark/imu'
 READY_S = 300.0  # for a node that compiles first
@@ -44,17 +43,10 @@ def live(recording: Recording, motion: Motion, speed: float) -> Live:
         return in_child(play, recording, motion, speed, process.pid, began, threads=2)
 
 
-@contextmanager
-def ros_surroundings(scratch: Path) -> Iterator[None]:
+def ros_surroundings(scratch: Path) -> AbstractContextManager[None]:
     """Nobody else's nodes: this machine only, and a domain that the user chose or hardly anybody uses."""
-    before = dict(os.environ)
-    os.environ.setdefault('ROS_DOMAIN_ID', str(random.randint(215, 232)))
-    os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_LOG_DIR=str(scratch))
-    try:
-        yield
-    finally:
-        os.environ.clear()
-        os.environ.update(before)
+    return environment({'ROS_DOMAIN_ID': os.environ.get('ROS_DOMAIN_ID', str(random.randint(215, 232))),
+                        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_LOG_DIR': str(scratch)})
 
 
 @contextmanager
@@ -161,7 +153,7 @@ class Player:
 
     def _on_diagnostics(self, msg: Any) -> None:
         name = NODE.strip('/')
-        self._values = diagnosis_values(msg, name) or self._values
+        self._values = received.diagnosis_values(msg, name) or self._values
         self._status = received.diagnosis(msg, name) or self._status
 
     def _drops(self) -> dict[str, int]:
@@ -188,13 +180,13 @@ def message_costs(recording: Recording) -> list[MessageCost]:
         hz, imu_hz = sample_rate(tape.frames_ns), sample_rate(tape.imu.t_ns)
         image = serialize_message(image_message(new, source, tape.images[0], 0))
         kind = new.type(f'sensor_msgs/msg/{"CompressedImage" if source.topics.compressed else "Image"}')
-        received = deserialize_message(image, kind)
+        heard = deserialize_message(image, kind)
         sample = serialize_message(outputs.imu(new, 0, tape.imu.gyro_B[0], tape.imu.accel_B[0], 'imu'))
         estimate = _some_estimate()
         marker, ends = marker_maker(new, serialize_message), np.zeros((MAP_LINES, 2, 3))
         costs = {
             'image deserialised': (lambda: deserialize_message(image, kind), hz),
-            'image decoded': (lambda: source.frame(received), hz),
+            'image decoded': (lambda: source.frame(heard), hz),
             'IMU sample read': (lambda: sensors.imu_of_cdr(sample), imu_hz),
             'odometry made and serialised': (
                 lambda: serialize_message(outputs.odometry(new, estimate, 'odom', 'imu_link', 0.0)), hz),

@@ -201,10 +201,9 @@ def _stage_figures(threads: str, stages: list[Stage], kernel: Cost) -> dict[str,
 FRAMES = """\
 `read` is all that comes from the bag with a frame, decoding of the image apart; `publish` makes, serialises and writes
 (into an MCAP file) what the node would publish; `total` is the method, of which `track` (the front end), `initialise`,
-`optimise`, `map` (keyframes only) and `marginalise` are parts. Tracked lines sample the image as
-received through a table of the lens; only to look for new ones it is undistorted, at half the size, within `front end:
-detect`. CPU time is that of all threads. One thread has
-one core, two have two; only OpenCV and BLAS use them."""
+`optimise`, `map` (keyframes only) and `marginalise` are parts. Tracked lines sample the image as received through a
+table of the lens; only to look for new ones it is undistorted, at half the size, within `front end: detect`. CPU time
+is that of all threads. One thread has one core, two have two; only OpenCV and BLAS use them."""
 STARTUP = f"""\
 From the start of the process `line_slam replay` to its end over the first {STARTUP_S:g} s of the recording, which is a
 little more than to the first processed frame."""

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ from line_slam_ros.cli.bag_calibration import find_calibration, with_calibration
 from line_slam_ros.cli.bag_reader import Bag, open_bag
 from line_slam_ros.cli.bag_topics import Topics, choose_topics
 from line_slam_ros.cli.benchmark_runs import ONE_THREAD
-from line_slam_ros.cli.replaying import Clip
+from line_slam_ros.cli.replaying import IMU_CAPACITY, WAITING, Clip
 from line_slam_ros.config import Config
 from line_slam_ros.config_file import load
 from line_slam_ros.imu_buffer import Vector
@@ -32,7 +32,6 @@ from msg_adapters.factories import MessageFactory, bag_messages
 from msg_adapters.marker_bytes import LineMarkers, Serialiser
 
 Result = TypeVar('Result')
-_WAITING, _IMU_CAPACITY = 300, 100_000  # as replay
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ class Source:
     def inbox(self) -> Inbox:
         """As replay has it; samples come scaled."""
         c = self.calibration
-        return Inbox(_WAITING, c.time_offset, (c.width, c.height), imu_capacity=_IMU_CAPACITY)
+        return Inbox(WAITING, c.time_offset, (c.width, c.height), imu_capacity=IMU_CAPACITY)
 
     def messages(self) -> Iterator[tuple[str, Any]]:
         """(topic, message) of images, (topic, fields) of inertial data."""
@@ -155,12 +154,22 @@ def in_child(work: Callable[..., Result], *args: Any, threads: int = 1) -> Resul
 @contextmanager
 def surroundings(threads: int, **variables: str) -> Iterator[None]:
     """What processes started in here inherit: so many cores, threads of the libraries, and environment variables."""
-    cores, environment = os.sched_getaffinity(0), dict(os.environ)
+    cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, sorted(cores)[:threads])
-    os.environ.update(dict.fromkeys(ONE_THREAD, str(threads)) | variables)
+    try:
+        with environment(dict.fromkeys(ONE_THREAD, str(threads)) | variables):
+            yield
+    finally:
+        os.sched_setaffinity(0, cores)
+
+
+@contextmanager
+def environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Environment variables, as long as it takes."""
+    before = dict(os.environ)
+    os.environ.update(variables)
     try:
         yield
     finally:
-        os.sched_setaffinity(0, cores)
         os.environ.clear()
-        os.environ.update(environment)
+        os.environ.update(before)

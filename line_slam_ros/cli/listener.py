@@ -37,7 +37,7 @@ class Listener(AbstractContextManager['Listener']):
         self._node, self._slam, self._directory = node, slam_name, directory
         self.poses: list[tuple[int, F64]] = []  # t_ns, T_WB
         self.lines = 0  # in the newest map
-        self.diagnosis = ''  # what the node said of itself last
+        self.diagnosis, self.frames_waiting = '', 0  # what the node said of itself last
         self.now_ns = 0  # log time of what comes in
         self._active, self._best, self._image = 0, -1, None
         self._new, self._typestore = ros_messages(), get_typestore(Stores.ROS2_JAZZY)
@@ -110,7 +110,9 @@ class Listener(AbstractContextManager['Listener']):
             self._best, self._image = self._active, received.bgr_pixels(msg)
 
     def _on_diagnostics(self, msg: Any) -> None:
-        self.diagnosis = received.diagnosis(msg, self._slam.rsplit('/', 1)[-1]) or self.diagnosis
+        name = self._slam.rsplit('/', 1)[-1]
+        self.diagnosis = received.diagnosis(msg, name) or self.diagnosis
+        self.frames_waiting = int(received.diagnosis_values(msg, name).get('frames waiting', self.frames_waiting))
 
     def _answer(self, executor: Executor, future: Future) -> Any:
         executor.spin_until_future_complete(future, timeout_sec=_ANSWER_S)

@@ -4,7 +4,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import rclpy
 from rclpy.duration import Duration
@@ -19,6 +19,7 @@ from msg_adapters import outputs
 from msg_adapters.factories import ros_messages
 
 _CLOCK_PERIOD_NS = 10_000_000
+_LATE_S = 0.1  # that a message may be behind the schedule
 _QUEUE = 100  # messages that a reliable reader may lag behind
 _DELIVERY = Duration(seconds=2)
 _SENSORS = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage', 'sensor_msgs/msg/Imu')
@@ -69,24 +70,13 @@ class Session:
         whole = self._args.start == 0.0 and self._args.duration == float('inf')
         total = self._bag.counts.total() if whole else None
         with tqdm(total=total, unit='msg', desc='play', dynamic_ncols=True, mininterval=0.5) as progress:
-            for due, topic, t_ns, data in self._schedule():
+            args = self._args
+            for due, topic, t_ns, data in schedule(self._bag.log(), args.start, args.duration, args.rate):
                 self._spin_until(due)
                 listener.now_ns = t_ns
                 self._player.publish(topic, t_ns, data)
                 progress.set_postfix(poses=len(listener.poses), lines=listener.lines, refresh=False)
                 progress.update()
-
-    def _schedule(self) -> Iterator[tuple[float, str, int, bytes]]:
-        """(when on the monotonic clock, topic, log time, CDR) of the chosen part of the bag."""
-        first_ns = began = None
-        for topic, t_ns, data in self._bag.log():
-            first_ns = t_ns if first_ns is None else first_ns
-            seconds = (t_ns - first_ns) * 1e-9 - self._args.start
-            if seconds > self._args.duration:
-                return
-            if seconds >= 0:
-                began = time.monotonic() if began is None else began
-                yield began + seconds / self._args.rate, topic, t_ns, data
 
     def _is_awaited(self) -> bool:
         """Whether somebody subscribed in time; the other topics of that node get half a second more to be found."""
@@ -99,16 +89,35 @@ class Session:
         return True
 
     def _hear_the_rest(self, listener: Listener) -> None:
-        """Until everything has been delivered and no pose has come for two seconds."""
+        """Until everything has been delivered, no pose has come for two seconds and no image waits in the node."""
         self._player.finish()
         before = -1
-        while listener.is_connected and len(listener.poses) > before:
+        while listener.is_connected and (len(listener.poses) > before or listener.frames_waiting):
             before = len(listener.poses)
             self._spin_until(time.monotonic() + 2.0)
 
     def _spin_until(self, due: float) -> None:
         while (remaining := due - time.monotonic()) > 0:
             self._executor.spin_once(timeout_sec=remaining)
+
+
+def schedule(log: Iterable[tuple[str, int, bytes]], start: float, duration: float,
+             rate: float) -> Iterator[tuple[float, str, int, bytes]]:
+    """(when on the monotonic clock, topic, log time, CDR) of those messages of log, (topic, log time in ns, CDR), that
+    begin start (s) after the first and last for duration (s), rate times as fast as recorded.
+
+    What comes late, for instance on a busy machine, is not made up for at once: a burst overflows the readers' queues.
+    """
+    first_ns = began = None
+    for topic, t_ns, data in log:
+        first_ns = t_ns if first_ns is None else first_ns
+        seconds = (t_ns - first_ns) * 1e-9 - start
+        if seconds > duration:
+            return
+        if seconds >= 0:
+            now = time.monotonic() - seconds / rate
+            began = now if began is None else max(began, now - _LATE_S)
+            yield began + seconds / rate, topic, t_ns, data
 
 
 class Player:

@@ -27,8 +27,8 @@ from line_slam_ros.slam import Slam
 from line_slam_ros.types import Calibration, Estimate, Frame, ImuBatch
 from msg_adapters import sensors
 
-_WAITING = 300  # frames that may wait for data recorded late; 110 MB at 752x480
-_IMU_CAPACITY = 100_000  # samples; a bag may hold minutes of them before its first image
+WAITING = 300  # frames that may wait for data recorded late; 110 MB at 752x480
+IMU_CAPACITY = 100_000  # samples; a bag may hold minutes of them before its first image
 
 
 def replay(args: argparse.Namespace) -> int:
@@ -131,8 +131,8 @@ class ImuRun(Run):
         super().__init__(topics, stream)
         self.imu_topic = topics.motion
         self.slam = Slam(config, calibration)
-        self.inbox = Inbox(_WAITING, calibration.time_offset, (calibration.width, calibration.height),
-                           shell.accel_scale, _IMU_CAPACITY)
+        self.inbox = Inbox(WAITING, calibration.time_offset, (calibration.width, calibration.height),
+                           shell.accel_scale, IMU_CAPACITY)
 
     def _motion(self, message: Any) -> None:
         self.inbox.imu(*self._stream.imu(*message))
@@ -148,7 +148,7 @@ class PoseRun(Run):
                  stream: DegradedStream) -> None:
         super().__init__(topics, stream)
         self.slam = LineMapper(config, calibration)
-        self.inbox = PoseInbox(_WAITING, calibration.time_offset, (calibration.width, calibration.height))
+        self.inbox = PoseInbox(WAITING, calibration.time_offset, (calibration.width, calibration.height))
 
     def _motion(self, message: Any) -> None:
         self.inbox.pose(*sensors.pose_from_msg(message))

@@ -276,7 +276,7 @@ class Solver:
             self._take_gradient()
             before = self._save()
             predicted = self._step()
-            new_cost = self._evaluate() if predicted > 0.0 else np.inf
+            new_cost = self._evaluate() if np.isfinite(predicted) else np.inf
             gain, damped = cost - new_cost, self.linearised_with > LEAST_DAMPING  # what is damped may still be far off
             trusted = abs(gain - predicted) < TRUSTED * predicted
             if gain > 0.0:
@@ -285,17 +285,21 @@ class Solver:
                 self._restore(before)
                 self._evaluate()
                 damping = min(max(10.0 * damping, 1e-4), 1e4) if fresh else damping
-            if min(abs(gain), predicted or np.inf) < CONVERGED and not damped:
+            if min(abs(gain), predicted) < CONVERGED and not damped:
                 break
         return cost
 
     def unsettled(self) -> float:
-        """By how much the cost would fall by the equations linearised last; infinity if they have no solution."""
+        """By how much the cost should fall by the equations linearised last; infinity if they have no solution.
+
+        Leaves the step of rig and states that they ask for in dx.
+        """
         factor, rows = self._factored(), self.window.rows
         if not len(factor):
             return np.inf
-        s = self._s[:self._rows]
-        return 0.5 * float(s @ s + self.g[:rows] @ _solve(factor, self.g[:rows]))
+        s, g, dx = self._s[:self._rows], self.g[:rows], self._dx[:rows]
+        dx[:] = _solve(factor, -g)
+        return 0.5 * float(s @ s - g @ dx)
 
     def _factored(self) -> F64:
         """Of the equations; empty when they have no solution."""
@@ -305,14 +309,12 @@ class Solver:
         return self._factor
 
     def _step(self) -> float:
-        """Solve the equations and move everything; returns by how much the cost should fall, 0 without a solution."""
-        w, dx, rows, n = self.window, self._dx, self.window.rows, self.window.n
-        factor = self._factored()
-        if not len(factor):
-            return 0.0
+        """Solve the equations and move everything, if they have a solution; returns what unsettled does."""
+        predicted = self.unsettled()
+        if not np.isfinite(predicted):
+            return predicted
+        w, dx, n = self.window, self._dx, self.window.n
         s, S = self._s[:self._rows], self._S[:self._rows, :column(n)]
-        dx[:rows] = _solve(factor, -self.g[:rows])
-        predicted = 0.5 * float(s @ s - self.g[:rows] @ dx[:rows])
         columns = self._columns[:column(n)]
         gather(n, dx, columns)
         t = s + S @ columns
