@@ -136,7 +136,7 @@ class Bootstrap:
         e.linearise()
         if e.solver.unsettled() > MAX_UNSETTLED:
             return 'metric scale: a first estimate that settles, accelerate the camera'
-        cov = e.solver.covariance()[3:6, 3:6]
+        cov = e.solver.covariance(e.window.n - 1)[3:6, 3:6]
         distance = max(float(np.linalg.norm(moved)), 1e-9)
         sigma = float(np.sqrt(moved @ cov @ moved)) / distance**2
         if sigma > self._options.init_max_scale_sigma:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from line_slam_ros.config import Estimator as Options
+from line_slam_ros.estimation.following import Follower
 from line_slam_ros.estimation.initialisation import Snapshot, Start
 from line_slam_ros.estimation.marginalisation import drop_state, marginalise_oldest
 from line_slam_ros.estimation.shift import FEW_CORNERS, corner_shifts, segment_shifts
@@ -17,6 +18,7 @@ from line_slam_ros.geometry.line_forms import unit_world_lines
 from line_slam_ros.types import F64, I64, Calibration, LineForm, Observations, RigCorrection, Samples
 
 MAX_GYRO_BIAS, MAX_ACCEL_BIAS, MAX_SPEED = 0.5, 2.5, 50.0  # rad/s, m/s^2, m/s: beyond, the estimate is nonsense
+MIN_FOLLOWED = 20  # known landmarks that a state must see to be estimated against them alone
 MIN_FEATURES = 6  # fewer that an earlier state saw, too, and the camera is blind
 
 
@@ -49,7 +51,8 @@ class Estimator:
         self.solver = Solver(self.window, SolverOptions(
             self.g_W, options.loss_scale**2, options.loss_scale**2,
             LineForm.of(options.line_representation)))
-        self.newest_is_keyframe = True
+        self.newest_is_keyframe, self._followed = True, False
+        self._follower = Follower(self.solver)
         self.failure = ''
         self._last_sight_ns = 0
         self._marginalised = False  # until then the prior is only the gauge, and nothing is bound to first estimates
@@ -60,6 +63,7 @@ class Estimator:
         """Fill the window with initial states; the first one's position and heading become the gauge."""
         w = self.window
         w.clear()
+        self._follower.clear()
         bias = np.concatenate([start.gyro_bias, np.zeros(3)])
         for k, shot in enumerate(shots):
             w.append(shot.t_ns, start.R_WB[k], start.p_W[k], start.v_W[k], bias, shot.samples)
@@ -75,7 +79,7 @@ class Estimator:
         information[:3, :3] = R.T @ information[:3, :3] @ R
         w.freeze(np.arange(1))
         w.prior_H[state_row(0):state_row(1), state_row(0):state_row(1)] = information
-        self.newest_is_keyframe, self._marginalised = True, False
+        self.newest_is_keyframe, self._followed, self._marginalised = True, False, False
         self._triangulate()
 
     def refine(self, rounds: int) -> float:
@@ -110,12 +114,15 @@ class Estimator:
 
     def covariance(self) -> F64:
         """(9, 9) of the newest state's [rotation in B, position in W, velocity in W]."""
+        if self._followed:
+            return self._follower.covariance()[:9, :9]
         self._undamp()
-        return self.solver.covariance()[:9, :9]
+        return self.solver.covariance(self.window.n - 1)[:9, :9]
 
     def _undamp(self) -> None:
-        """Covariances are by the equations of the last step, or by fresh ones if those are damped: no knowledge."""
-        if self.solver.linearised_with > LEAST_DAMPING:
+        """Covariances are by the equations of the last step; by fresh ones if those are damped, which is no knowledge,
+        or do not know the newest state."""
+        if self._followed or self.solver.linearised_with > LEAST_DAMPING:
             self.linearise()
 
     def last_good(self) -> tuple[F64, F64] | None:
@@ -156,14 +163,32 @@ class Estimator:
         if not self.newest_is_keyframe and not self._borders_rest(newest - 1):
             drop_state(self.solver, newest - 1)
         self._forget_ended()
-        self._triangulate()
-        if not self._marginalised:
-            w.recentre_prior()
-        self.solver.optimise(self.options.max_iterations)
-        outliers = self._cull()
         self.newest_is_keyframe = self._is_keyframe()
+        self._followed = self._may_follow() and self._follower.follow(self.options.max_iterations)
+        if not self._followed:
+            self._optimise()
+        outliers = self._cull()
         self.failure = self._health()
         return outliers
+
+    def _may_follow(self) -> bool:
+        """Whether to leave the window as it is: between keyframes, if the newest state sees enough that it knows."""
+        if self.newest_is_keyframe or not (self._marginalised and self._follower.anchored):
+            return False
+        k = self.window.n - 1
+        seen = [(t.seen[:t.count, k], t.solved[:t.count]) for t in (self.window.points, self.window.lines)]
+        known = sum(int((now & solved).sum()) for now, solved in seen)
+        return known >= max(0.5 * sum(int(now.sum()) for now, _ in seen), MIN_FOLLOWED)
+
+    def _optimise(self) -> None:
+        """The whole window."""
+        self._triangulate()
+        if not self._marginalised:
+            self.window.recentre_prior()
+        self.solver.optimise(self.options.max_iterations)
+        if self._marginalised:
+            self._undamp()
+            self._follower.anchor(self.window.n - (1 if self.newest_is_keyframe else 2))
 
     def _borders_rest(self, slot: int) -> bool:
         """Whether a state is the first or last of a rest: those stay, and the links in between hold rest alone."""

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.linalg.lapack import dpotrf, dpotrs
 
+from line_slam_ros.estimation.dense import cholesky, hold, regular, solve
 from line_slam_ros.estimation.landmarks import (
     LANES,
     add_gradient,
@@ -32,7 +32,6 @@ from line_slam_ros.factors.imu_factor import imu_jacobians, imu_residual
 from line_slam_ros.geometry.lie_kernels import retract_rotation
 from line_slam_ros.types import F64, LineForm
 
-TRACE = 1e-9  # information that holds what nothing says anything about
 TRUSTED = 0.5  # of the predicted change of the cost: a smaller error, and the Jacobians serve for another step
 LEAST_DAMPING = 1e-9  # too small to matter
 CONVERGED = 3.0  # change of the cost (half squared standard deviations) below which iterating ends: of some 200 numbers
@@ -172,7 +171,7 @@ class Solver:
         self._J, self._count = np.zeros((slots, 2 * (rows_p + rows_l), LANES)), np.zeros(slots, np.int64)
         self._S, self._s = np.zeros((3 * rows_p + 4 * rows_l, column(slots))), np.zeros(3 * rows_p + 4 * rows_l)
         self._rows = 0  # of S, s in use
-        self._columns = np.zeros(column(slots))
+        self._columns, self._own = np.zeros(column(slots)), np.zeros((0, LANES, LANES))
         self._factor: F64 | None = None  # upper triangular, of H; empty: it has none; None: not computed yet
         self.linearised_with = 0.0  # damping that H's factor and the landmarks' L hold
 
@@ -192,15 +191,21 @@ class Solver:
 
     def _evaluate(self) -> float:
         """Residuals at the present estimate; returns the robust cost."""
+        w = self.window
+        d = w.delta(self._delta)
+        return (float(d @ (0.5 * (w.prior_H @ d) + w.prior_g)) + rest_cost(w) + self.inertial_cost()
+                + self.landmark_cost(self.points.use, w.points.seen, w.points.sigma, self.lines.use, w.lines.seen,
+                                     w.lines.sigma))
+
+    def landmark_cost(self, use_points, points_seen, point_sigma, use_lines, lines_seen, line_sigma) -> float:
+        """Robust cost of observations (rows, slots) of the landmarks of rows in use; their chi2, pull and weight."""
         w, o = self.window, self.options
         p, q, kp, kl = w.points, w.lines, self.points, self.lines
         self._expose()
-        d = w.delta(self._delta)
-        return (float(d @ (0.5 * (w.prior_H @ d) + w.prior_g)) + rest_cost(w) + self.inertial_cost()
-                + point_residuals(w.n, self._R, self._p, w.R_BC, w.p_BC, kp.use, p.seen, p.z, p.sigma, p.abr, p.R_WA,
-                                  p.p_WA, o.point_c2, o.rho0, o.w_rho, kp.chi2, kp.pull, kp.weight, kp.a)
-                + line_residuals(w.n, self._R, self._p, w.R_BC, w.p_BC, kl.use, q.seen, q.z, q.sigma, int(o.line_form),
-                                 q.values, q.origin, o.line_c2, kl.chi2, kl.pull, kl.weight, kl.a))
+        return (point_residuals(w.n, self._R, self._p, w.R_BC, w.p_BC, use_points, points_seen, p.z, point_sigma,
+                                p.abr, p.R_WA, p.p_WA, o.point_c2, o.rho0, o.w_rho, kp.chi2, kp.pull, kp.weight, kp.a)
+                + line_residuals(w.n, self._R, self._p, w.R_BC, w.p_BC, use_lines, lines_seen, q.z, line_sigma,
+                                 int(o.line_form), q.values, q.origin, o.line_c2, kl.chi2, kl.pull, kl.weight, kl.a))
 
     def _take_jacobians(self, damping: float) -> None:
         """Jacobians at the first estimates, with the weights of the last evaluation: H, and all that steps need."""
@@ -224,10 +229,10 @@ class Solver:
                        S)
         for kind in (kp, kl):
             eliminate(kind.use, kind.size, damping, kind.L, kind.first, S)
-        own = np.stack([J[:k].T @ J[:k] for J, k in zip(self._J[:n], self._count, strict=False)])
-        add_hessian(n, own, S.T @ S, self.H)
+        self._own = np.stack([J[:k].T @ J[:k] for J, k in zip(self._J[:n], self._count, strict=False)])
+        add_hessian(n, self._own, S.T @ S, self.H)
         if not w.rig_sigma.all():
-            _hold(self.H, np.flatnonzero(w.rig_sigma == 0.0))
+            hold(self.H, np.flatnonzero(w.rig_sigma == 0.0))
 
     def _take_gradient(self) -> None:
         """g of the last evaluation, by the Jacobians taken last."""
@@ -298,14 +303,14 @@ class Solver:
         if not len(factor):
             return np.inf
         s, g, dx = self._s[:self._rows], self.g[:rows], self._dx[:rows]
-        dx[:] = _solve(factor, -g)
+        dx[:] = solve(factor, -g)
         return 0.5 * float(s @ s - g @ dx)
 
     def _factored(self) -> F64:
         """Of the equations; empty when they have no solution."""
         if self._factor is None:
             rows = self.window.rows
-            self._factor = _cholesky(self.H[:rows, :rows], self.linearised_with)
+            self._factor = cholesky(self.H[:rows, :rows], self.linearised_with)
         return self._factor
 
     def _step(self) -> float:
@@ -340,13 +345,29 @@ class Solver:
         return [(w.R, n), (w.p, n), (w.v, n), (w.b, n), (w.R_BC, 3), (w.p_BC, 3), (w.delay, 1), (w.points.abr, p),
                 (w.lines.values, q)]
 
-    def covariance(self) -> F64:
-        """(15, 15) of the newest state given everything in the window, by the equations linearised last.
+    def covariance(self, slot: int) -> F64:
+        """(15, 15) of a state given everything in the window, by the equations linearised last.
 
         LinAlgError when these have no solution.
         """
-        newest = np.linalg.inv(_regular(self._factored())[-STATE:, -STATE:])
-        return newest @ newest.T
+        latest = np.linalg.inv(regular(self._factored())[state_row(slot):, state_row(slot):])[:STATE]
+        return latest @ latest.T
+
+    def information(self, slot: int) -> F64:
+        """(15, 15) about a state, given the landmarks, from all that comes before it and what it sees itself.
+
+        The rest of a state before the newest is left out, as in linearise. By the Jacobians taken last; LinAlgError
+        when the equations have no solution.
+        """
+        w, o, links, rows = self.window, self.options, (0, slot), state_row(slot + 1)
+        H = w.prior_H.copy()
+        add_link_hessians(*links, w.R0, w.p0, w.v0, w.b0, w.dt, w.dR, w.dp, w.dv, w.J_b, w.b_lin, w.W, w.w_b, o.g_W,
+                          self._link_J, H)
+        add_rest(w, links, H)
+        add_hessian(slot + 1, self._own, np.zeros((column(slot + 1), column(slot + 1))), H)
+        hold(H, np.flatnonzero(w.rig_sigma == 0.0))
+        latest = regular(cholesky(H[:rows, :rows]))[-STATE:, -STATE:]
+        return latest.T @ latest
 
     def line_covariances(self, lines: np.ndarray) -> F64:
         """(L, 4, 4) of lines (rows when Jacobians were taken last) in their tangent, as the newest camera knows them.
@@ -356,37 +377,12 @@ class Solver:
         """
         n, rows = self.window.n, self.window.rows
         H = self.H[:rows, :rows].copy()
-        _hold(H, np.arange(state_row(n - 1), state_row(n - 1) + POSE))
+        hold(H, np.arange(state_row(n - 1), state_row(n - 1) + POSE))
         seen = np.concatenate([np.arange(RIG), *(np.arange(state_row(k), state_row(k) + POSE) for k in range(n - 1))])
         ties = np.zeros((rows, len(seen)))
         ties[seen, np.arange(len(seen))] = 1.0
-        C = _solve(_regular(_cholesky(H)), ties)[seen]
+        C = solve(regular(cholesky(H)), ties)[seen]
         S = self._S[self.lines.first[lines, None] + np.arange(4), :len(seen)]
         inverse = np.linalg.inv(self.lines.L[lines]).transpose(0, 2, 1)
         AW = inverse @ S
         return inverse @ inverse.transpose(0, 2, 1) + AW @ C @ AW.transpose(0, 2, 1)
-
-
-def _hold(H: F64, rows: np.ndarray) -> None:
-    """Make the unknowns of those rows constants, in place."""
-    H[rows], H[:, rows], H[rows, rows] = 0.0, 0.0, 1.0
-
-
-def _cholesky(H: F64, damping: float = 0.0) -> F64:
-    """Upper U (D, D) with U' U = H, its diagonal times 1 + damping; (0, 0) when H is not positive definite."""
-    factor = H.copy()
-    np.fill_diagonal(factor, (1.0 + damping) * np.diag(H) + TRACE)
-    lower, info = dpotrf(factor.T, lower=1, clean=1, overwrite_a=1)
-    return lower.T if info == 0 else np.zeros((0, 0))
-
-
-def _regular(factor: F64) -> F64:
-    """The factor, if there is one; LinAlgError if not."""
-    if not len(factor):
-        raise np.linalg.LinAlgError('not positive definite')
-    return factor
-
-
-def _solve(factor: F64, b: F64) -> F64:
-    """x (D, ...) with U' U x = b."""
-    return dpotrs(factor.T, b, lower=1)[0]

@@ -88,6 +88,7 @@ class LandmarkTable:
         self.solved = np.zeros(rows, np.bool_)  # has a 3D estimate and takes part in the optimisation
         self.views = np.zeros(rows, np.int64)  # keyframes that ever saw it, also those that left the window
         self.taken = np.full(rows, -1, np.int64)  # its row when Jacobians were taken last; -1: not there
+        # L (rows, d, d), a field of both: L L' is its Hessian, given the poses, at the last anchor (following.py)
         self._columns = ['ids', 'seen', 'z', 'sigma', 'solved', 'views', 'taken', *fields]
         for name, shape in fields.items():
             setattr(self, name, np.zeros((rows, *shape)))
@@ -155,8 +156,8 @@ class Window:
         self.rig_sigma = np.zeros(RIG)  # of what was given; what is zero is not estimated
         size = RIG + STATE * slots
         self.prior_H, self.prior_g = np.zeros((size, size)), np.zeros(size)
-        self.points = LandmarkTable(max_points, slots, (2,), {'abr': (3,), 'R_WA': (3, 3), 'p_WA': (3,)})
-        self.lines = LandmarkTable(max_lines, slots, (2, 2), {'values': (VALUES,), 'origin': (3,)})
+        self.points = LandmarkTable(max_points, slots, (2,), {'abr': (3,), 'R_WA': (3, 3), 'p_WA': (3,), 'L': (3, 3)})
+        self.lines = LandmarkTable(max_lines, slots, (2, 2), {'values': (VALUES,), 'origin': (3,), 'L': (4, 4)})
 
     def clear(self) -> None:
         """Back to an empty window."""
