@@ -1,15 +1,31 @@
-"""Whether numba has compiled the kernels before, on this machine and in this version."""
+"""How kernels are compiled, and whether they have been before, on this machine and in this version."""
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from numba import njit
+from numba.extending import register_jitable
 
 COMPILING = 'compiling the numerical kernels for this machine, once: this takes a minute or so'
 
 
-@njit(cache=True, nogil=True)
+def kernel(function: Any = None, **options: Any) -> Any:
+    """Decorator: compiled when called first, kept on disk, without the GIL. No C function: nobody takes its address."""
+    return njit(function, cache=True, nogil=True, error_model='numpy', no_cfunc_wrapper=True, **options)
+
+
+def inner(function: Any = None, **options: Any) -> Any:
+    """Decorator of what only kernels call: compiled into them, one version whatever constants they pass.
+
+    Half as long to compile as a kernel; called from Python it stays Python.
+    """
+    decorate = register_jitable(error_model='numpy', no_cfunc_wrapper=True, **options)
+    return decorate(function) if function else decorate
+
+
+@kernel
 def fill():
     """Called when every kernel has been: where this one is in the cache, so are the others."""
 

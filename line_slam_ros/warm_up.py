@@ -27,11 +27,12 @@ from line_slam_ros.types import Calibration, Frame
 BESIDE = """import sys
 sys.path[:] = {path!r}
 from line_slam_ros import warm_up
+warm_up.LineMap.warm_up(warm_up.Config().mapping)
 warm_up.warm_up_estimator(warm_up.EstimatorOptions())"""
 
 
 def warm_up(front_end: FrontEnd, calibration: Calibration, config: Config, tell: Callable[[str], None]) -> None:
-    """Everything. With nothing in the cache this is told, and another process compiles the estimator meanwhile."""
+    """Everything. With nothing in the cache this is told, and another process compiles map and estimator meanwhile."""
     beside, empty = None, cache_is_empty(tell)
     quaternion_from_matrix(np.eye(3))
     turned(np.array([0.0, 0.1]), np.zeros((2, 3)), np.zeros(3))
@@ -39,11 +40,11 @@ def warm_up(front_end: FrontEnd, calibration: Calibration, config: Config, tell:
     if empty and len(os.sched_getaffinity(0)) > 1:
         beside = subprocess.Popen([sys.executable, '-c', BESIDE.format(path=sys.path)])
         atexit.register(beside.kill)
-    LineMap.warm_up(config.mapping)
     warm_up_lenses()
     warm_up_front_end(front_end, calibration)
     if beside is not None:
         beside.wait()  # what it could not compile is compiled here, and its error comes up again
+    LineMap.warm_up(config.mapping)
     warm_up_estimator(config.estimator)
     fill()
 

@@ -20,13 +20,14 @@ _TRAJECTORY = '#e04000'
 def save(path: Path, image_bgr: U8 | None, positions_W: Sequence[F64], segments: LineSegments) -> None:
     """Writes a PNG; image (H, W, 3) BGR or None, positions of the body (N, 3) m, the map's segments."""
     positions = np.asarray(positions_W, float).reshape(-1, 3)
-    sheet = Figure(figsize=(18, 6), layout='constrained')
+    sheet = Figure(figsize=(18, 6))
+    sheet.subplots_adjust(left=0.01, right=0.97, bottom=0.09, top=0.93, wspace=0.13)  # measured layouts draw twice
     FigureCanvasAgg(sheet)
     _draw_image(sheet.add_subplot(1, 3, 1), image_bgr)
     low, high = _limits(positions, segments.ends)
     _draw_from_above(sheet.add_subplot(1, 3, 2), positions, segments.ends, low, high)
     _draw_in_3d(sheet.add_subplot(1, 3, 3, projection='3d'), positions, segments.ends, low, high)
-    sheet.savefig(path, dpi=100, metadata={'Software': None})
+    sheet.savefig(path, dpi=100, metadata={'Software': None}, pil_kwargs={'compress_level': 3})
 
 
 def _draw_image(axes: Any, image_bgr: U8 | None) -> None:

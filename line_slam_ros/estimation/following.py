@@ -8,7 +8,6 @@ each landmark, given the poses, counts as noise of its observation.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from line_slam_ros.estimation.dense import cholesky, solve
 from line_slam_ros.estimation.solver import (
@@ -23,6 +22,7 @@ from line_slam_ros.factors.line_reprojection import line_reprojection
 from line_slam_ros.factors.point_reprojection import inverse_depth_point, point_reprojection
 from line_slam_ros.geometry.lie import hat
 from line_slam_ros.geometry.line_forms import world_line
+from line_slam_ros.kernel_cache import inner, kernel
 from line_slam_ros.types import F64
 
 PAIR = slice(RIG, RIG + 2 * STATE)  # rows of both states in equations of their own
@@ -156,7 +156,7 @@ class Follower:
         return H, g
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def add_points(slot, R, p, R_BC, p_BC, count, z, sigma, abr, R_WA, p_WA, weight, pull, H, g):
     """Add what a slot's observations of the first count points say of its pose to H (6, 6) and g (6,)."""
     v, J_pose, J_rig, J_p = np.empty(2), np.empty((2, POSE)), np.empty((2, POSE)), np.empty((2, 3))
@@ -168,7 +168,7 @@ def add_points(slot, R, p, R_BC, p_BC, count, z, sigma, abr, R_WA, p_WA, weight,
                 add_pose(J_pose, sigma[i, slot], weight[i, slot], pull[i, slot], H, g)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def add_lines(slot, R, p, R_BC, p_BC, count, z, sigma, form, values, origin, weight, pull, H, g):
     """As add_points, for lines."""
     v, J_pose, J_rig, J_l = np.empty(2), np.empty((2, POSE)), np.empty((2, POSE)), np.empty((2, 6))
@@ -180,7 +180,7 @@ def add_lines(slot, R, p, R_BC, p_BC, count, z, sigma, form, values, origin, wei
                 add_pose(J_pose, sigma[i, slot], weight[i, slot], pull[i, slot], H, g)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner(forceinline=True)
 def add_pose(J, sigma, weight, pull, H, g):
     """Add one observation, its Jacobian J (2, 6) not whitened, pull (2,) its weighted whitened residual."""
     for k in range(2):
@@ -191,7 +191,7 @@ def add_pose(J, sigma, weight, pull, H, g):
                 H[a, c] += weight * x * J[k, c] / sigma[k]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def point_doubts(slot, R, p, R_BC, p_BC, seen, z, sigma, abr, R_WA, p_WA, L, total):
     """Standard deviations total (rows, slots, 2) of a slot's residuals: of the observation and of the point, given
     the poses. What the slot cannot see is no longer seen."""
@@ -205,7 +205,7 @@ def point_doubts(slot, R, p, R_BC, p_BC, seen, z, sigma, abr, R_WA, p_WA, L, tot
                 total[i, slot, k] = doubt(J_p[k], C, L[i], sigma[i, slot, k], y)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def line_doubts(slot, R, p, R_BC, p_BC, seen, z, sigma, form, values, origin, L, total):
     """As point_doubts, for lines."""
     v, J_pose, J_rig, J_l = np.empty(2), np.empty((2, POSE)), np.empty((2, POSE)), np.empty((2, 6))
@@ -218,7 +218,7 @@ def line_doubts(slot, R, p, R_BC, p_BC, seen, z, sigma, form, values, origin, L,
                 total[i, slot, k] = doubt(J_l[k], C, L[i], sigma[i, slot, k], y)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def doubt(J, C, L, sigma, y):
     """Standard deviation of a residual that changes by J C with a landmark of covariance (L L')^-1; y: scratch."""
     square = sigma * sigma

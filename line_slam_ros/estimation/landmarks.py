@@ -15,26 +15,26 @@ their gradients and steps S' s and S dx with s = L^-1 a.
 R, p are the bodies' poses when the images were taken, twist (n, 6) their [angular velocity in B, velocity in W].
 """
 import numpy as np
-from numba import njit
 
 from line_slam_ros.estimation.window import POSE, RIG, state_row
 from line_slam_ros.factors.line_reprojection import line_reprojection, line_residual
 from line_slam_ros.factors.point_reprojection import inverse_depth_point, point_reprojection, point_residual
 from line_slam_ros.factors.robust import CAUCHY, robust
 from line_slam_ros.geometry.line_forms import move_line, world_line
+from line_slam_ros.kernel_cache import inner, kernel
 
 BEHIND = 100.0  # cost of a point behind its camera, squared standard deviations (a rejected step, not a gradient)
 OWN = RIG + POSE  # columns that one observation depends on
 LANES = 16  # OWN and more: what processors like, the rest is zero
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def column(slot):
     """First column of a slot's pose among those that cameras see."""
     return RIG + POSE * slot
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def point_residuals(n, R, p, R_BC, p_BC, use, seen, z, sigma, abr, R_WA, p_WA, c2, rho0, w_rho, chi2, pull, weight, a):
     """Robust cost of the points of rows with use[i]; fills their chi2, pull and weight, and starts their gradients a.
 
@@ -62,7 +62,7 @@ def point_residuals(n, R, p, R_BC, p_BC, use, seen, z, sigma, abr, R_WA, p_WA, c
     return 0.5 * cost
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def line_residuals(n, R, p, R_BC, p_BC, use, seen, z, sigma, form, values, origin, c2, chi2, pull, weight, a):
     """As point_residuals, for lines in any form (geometry/line_forms.py)."""
     r, n_W, d_W, C = np.empty(2), np.empty(3), np.empty(3), np.empty((6, 4))
@@ -81,7 +81,7 @@ def line_residuals(n, R, p, R_BC, p_BC, use, seen, z, sigma, form, values, origi
     return 0.5 * cost
 
 
-@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+@inner(forceinline=True)
 def _weigh(r, sigma, i, f, c2, chi2, pull, weight):
     """One residual r (2,) whitened and weighed robustly; returns its cost twice."""
     r0, r1 = r[0] / sigma[i, f, 0], r[1] / sigma[i, f, 1]
@@ -92,7 +92,7 @@ def _weigh(r, sigma, i, f, c2, chi2, pull, weight):
     return rho
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def point_jacobians(n, R, p, R_BC, p_BC, twist, use, z, sigma, abr, R_WA, p_WA, w_rho, weight, count, J, at, undo,
                     by_land, L, first, S):
     """Jacobians at poses (R, p) of all observations with a weight, and the points' rows of L and S (not eliminated).
@@ -121,7 +121,7 @@ def point_jacobians(n, R, p, R_BC, p_BC, twist, use, z, sigma, abr, R_WA, p_WA, 
         L[i, 2, 2] += w_rho * w_rho
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def line_jacobians(n, R, p, R_BC, p_BC, twist, use, z, sigma, form, values, origin, weight, count, J, at, undo, by_land,
                    L, first, S):
     """As point_jacobians, for lines."""
@@ -151,7 +151,7 @@ def line_jacobians(n, R, p, R_BC, p_BC, twist, use, z, sigma, form, values, orig
             L[i, j, j] += 1.0  # one radian of doubt: a line without parallax stays put instead of being singular
 
 
-@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+@inner(forceinline=True)
 def _append(i, f, root, sigma, twist, J_pose, J_rig, count, J, at, undo):
     """Whiten and weigh the Jacobians (2, 6) of one observation and put them into J.
 
@@ -169,7 +169,7 @@ def _append(i, f, root, sigma, twist, J_pose, J_rig, count, J, at, undo):
         J[f, m + k, RIG - 1] = scale * delay
 
 
-@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+@inner(forceinline=True)
 def _tie(i, f, d, J, at, by_land, L, first, S):
     """Add one observation to the Hessian (lower triangle, in L) of its landmark and to its ties, in S."""
     m, o, row = at[i, f], RIG + POSE * f, first[i]
@@ -183,9 +183,10 @@ def _tie(i, f, d, J, at, by_land, L, first, S):
             S[row + j, o + c] = x * J[f, m, RIG + c] + y * J[f, m + 1, RIG + c]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def eliminate(use, d, damping, L, first, S):
-    """Factor the landmarks' Hessians, diagonals times 1 + damping, in place, and turn their rows of S into L^-1 W.
+@kernel
+def eliminate(use, d, damping, L, first, columns, S):
+    """Factor the landmarks' Hessians, diagonals times 1 + damping, in place, and turn their rows of S into L^-1 W,
+    of so many columns.
 
     A landmark whose Hessian is singular stays where it is: its rows become zero, and its step will.
     """
@@ -195,20 +196,19 @@ def eliminate(use, d, damping, L, first, S):
         row = first[i]
         if not _factor(L[i], d, damping):
             L[i] = 0.0
-            S[row:row + d] = 0.0
+            S[row:row + d, :columns] = 0.0
             continue
         for j in range(d):
-            to = S[row + j]
             for k in range(j):
-                x, of = L[i, j, k], S[row + k]
-                for c in range(len(to)):
-                    to[c] -= x * of[c]
+                x = L[i, j, k]
+                for c in range(columns):
+                    S[row + j, c] -= x * S[row + k, c]
             x = 1.0 / L[i, j, j]
-            for c in range(len(to)):
-                to[c] *= x
+            for c in range(columns):
+                S[row + j, c] *= x
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _factor(A, d, damping):
     """Lower triangle of A (d, d), its diagonal times 1 + damping -> L in place; False when not positive definite."""
     for j in range(d):
@@ -226,7 +226,7 @@ def _factor(A, d, damping):
     return True
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def gradients(n, use, d, pull, at, undo, by_land, L, a, first, J, own, s):
     """Add what the residuals pull at each slot's [rig, pose] to own (slots, LANES); fill the landmarks' rows of s (K,)
     with L^-1 a."""
@@ -250,7 +250,7 @@ def gradients(n, use, d, pull, at, undo, by_land, L, a, first, J, own, s):
             s[row + j] = t / L[i, j, j] if L[i, j, j] > 0.0 else 0.0
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def add_gradient(n, own, g):
     """Add the slots' pulls own (slots, LANES) to the gradient g of the window."""
     for f in range(n):
@@ -260,7 +260,7 @@ def add_gradient(n, own, g):
             g[state_row(f) + c] += own[f, RIG + c]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def spread(n, q, g):
     """Add q (C,), over the columns that cameras see, to the gradient g of the window."""
     for c in range(RIG):
@@ -270,7 +270,7 @@ def spread(n, q, g):
             g[state_row(f) + c] += q[column(f) + c]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def gather(n, dx, columns):
     """Fill columns (C,) with the parts of a step dx of the window that cameras see."""
     for c in range(RIG):
@@ -280,11 +280,12 @@ def gather(n, dx, columns):
             columns[column(f) + c] = dx[state_row(f) + c]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def add_hessian(n, own, SS, H):
     """Add the slots' own Hessians own (slots, LANES, LANES) and -SS (C, C), over the columns that cameras see, to H."""
     rows = np.empty(len(SS), np.int64)
-    rows[:RIG] = np.arange(RIG)
+    for a in range(RIG):
+        rows[a] = a
     for f in range(n):
         for a in range(POSE):
             rows[column(f) + a] = state_row(f) + a
@@ -302,7 +303,7 @@ def add_hessian(n, own, SS, H):
             H[rows[a], rows[c]] -= SS[a, c]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def back_substitute(use, d, L, first, t, step):
     """Landmark steps (M, d) = -L'^-1 t, t (K,) = s + S dx."""
     for i in range(len(use)):
@@ -316,7 +317,7 @@ def back_substitute(use, d, L, first, t, step):
             step[i, j] = x / L[i, j, j]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def retract_landmarks(use_points, abr, point_step, use_lines, form, values, line_step):
     """Apply landmark steps in place; an inverse depth may shrink to a fifth per step but stays positive."""
     for i in range(len(use_points)):

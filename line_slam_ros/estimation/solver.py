@@ -7,7 +7,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from line_slam_ros.estimation.dense import cholesky, hold, regular, solve
 from line_slam_ros.estimation.landmarks import (
@@ -30,6 +29,7 @@ from line_slam_ros.estimation.rest import add_rest, add_rest_gradient, rest_cost
 from line_slam_ros.estimation.window import POSE, RIG, STATE, Window, state_row
 from line_slam_ros.factors.imu_factor import imu_jacobians, imu_residual
 from line_slam_ros.geometry.lie_kernels import retract_rotation
+from line_slam_ros.kernel_cache import kernel
 from line_slam_ros.types import F64, LineForm
 
 TRUSTED = 0.5  # of the predicted change of the cost: a smaller error, and the Jacobians serve for another step
@@ -38,7 +38,7 @@ CONVERGED = 3.0  # change of the cost (half squared standard deviations) below w
 # together, a sixth of a standard deviation each
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def link_residuals(first, last, R, p, v, b, dt, dR, dp, dv, J_b, b_lin, W, w_b, g_W, r):
     """Whitened residuals r (slots, 15) of the inertial links first .. last - 1; returns half their squares."""
     cost = 0.0
@@ -51,7 +51,7 @@ def link_residuals(first, last, R, p, v, b, dt, dR, dp, dv, J_b, b_lin, W, w_b, 
     return 0.5 * cost
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def add_link_hessians(first, last, R, p, v, b, dt, dR, dp, dv, J_b, b_lin, W, w_b, g_W, J, H):
     """Jacobians J (slots, 2, 15, 15), by both states, of the links first .. last - 1, and their squares into H."""
     products = np.empty((STATE, 3, STATE))  # of both states: J_i' J_i, J_i' J_j, J_j' J_j by rows
@@ -76,7 +76,7 @@ def add_link_hessians(first, last, R, p, v, b, dt, dR, dp, dv, J_b, b_lin, W, w_
                 H[q + i, q + j] += products[i, 2, j]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def add_link_gradients(first, last, J, r, g):
     """What the residuals r (slots, 15) of the links first .. last - 1 pull at their states, into g."""
     for k in range(first, last):
@@ -87,7 +87,7 @@ def add_link_gradients(first, last, J, r, g):
                     g[o + i] += J[k, side, x, i] * r[k, x]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def retract_states(n, R, p, v, b, dx):
     """Apply the states' rows of a step dx in place."""
     for k in range(n):
@@ -100,7 +100,7 @@ def retract_states(n, R, p, v, b, dx):
             b[k, i] += dx[o + 9 + i]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def exposures(n, R, p, v, rates, delay, R_exposed, p_exposed, twist):
     """Poses delay (s) after the states' stamps, to first order, and twist (n, 6) = [rates in B, v in W]."""
     turn = np.empty(3)
@@ -112,7 +112,7 @@ def exposures(n, R, p, v, rates, delay, R_exposed, p_exposed, twist):
         retract_rotation(R[k], turn, R_exposed[k])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def retract_rig(R_BC, p_BC, delay, dx):
     """Apply a step dx (7,) to the rig in place."""
     retract_rotation(R_BC, dx[:3], R_BC)
@@ -223,12 +223,12 @@ class Solver:
         S = self._S[:self._rows, :column(n)]
         S[:], self._count[:] = 0.0, 0
         point_jacobians(n, self._R0, self._p0, w.R_BC, w.p_BC, self._twist, kp.use, p.z, p.sigma, p.abr, p.R_WA, p.p_WA,
-                        o.w_rho, kp.weight, self._count, self._J, kp.at, kp.undo, kp.by_land, kp.L, kp.first, S)
+                        o.w_rho, kp.weight, self._count, self._J, kp.at, kp.undo, kp.by_land, kp.L, kp.first, self._S)
         line_jacobians(n, self._R0, self._p0, w.R_BC, w.p_BC, self._twist, kl.use, q.z, q.sigma, int(o.line_form),
                        q.values, q.origin, kl.weight, self._count, self._J, kl.at, kl.undo, kl.by_land, kl.L, kl.first,
-                       S)
+                       self._S)
         for kind in (kp, kl):
-            eliminate(kind.use, kind.size, damping, kind.L, kind.first, S)
+            eliminate(kind.use, kind.size, damping, kind.L, kind.first, column(n), self._S)
         self._own = np.stack([J[:k].T @ J[:k] for J, k in zip(self._J[:n], self._count, strict=False)])
         add_hessian(n, self._own, S.T @ S, self.H)
         if not w.rig_sigma.all():

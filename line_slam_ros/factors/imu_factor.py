@@ -4,7 +4,6 @@ Source: Forster et al. 2017, section VI; states [rotation, position, velocity, g
 right perturbation on the rotation, all else additive.
 """
 import numpy as np
-from numba import njit
 
 from line_slam_ros.geometry.lie_kernels import (
     exp_so3,
@@ -14,9 +13,10 @@ from line_slam_ros.geometry.lie_kernels import (
     right_jacobian,
     right_jacobian_inverse,
 )
+from line_slam_ros.kernel_cache import inner, kernel
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _raw_residual(R_i, p_i, v_i, b_i, R_j, p_j, v_j, b_j, dt, dR, dp, dv, J_b, b_lin, g_W, r, E, rho, mu):
     """Unwhitened residual r (15,); E = dR_corrected' R_i' R_j; rho, mu (3,) the position and velocity in frame i."""
     c, A, B = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
@@ -45,7 +45,7 @@ def _raw_residual(R_i, p_i, v_i, b_i, R_j, p_j, v_j, b_j, dt, dR, dp, dv, J_b, b
         r[9 + i] = b_j[i] - b_i[i]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def imu_residual(R_i, p_i, v_i, b_i, R_j, p_j, v_j, b_j, dt, dR, dp, dv, J_b, b_lin, W, w_b, g_W, r):
     """Fills the whitened residual r (15,) = [rotation, position, velocity, gyro bias, accel bias].
 
@@ -66,7 +66,7 @@ def imu_residual(R_i, p_i, v_i, b_i, R_j, p_j, v_j, b_j, dt, dR, dp, dv, J_b, b_
         r[9 + i] = w_b[i] * raw[9 + i]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def imu_jacobians(R_i, p_i, v_i, b_i, R_j, p_j, v_j, b_j, dt, dR, dp, dv, J_b, b_lin, W, w_b, g_W, J_i, J_j):
     """Fills J_i, J_j (15, 15): the whitened residual's derivatives by the two states."""
     E, rho, mu, raw = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(15)

@@ -4,12 +4,13 @@ Source: distance of the observed ends to the projected line, equations (11) to (
 document with (15) corrected.
 """
 import numpy as np
-from numba import njit
+
+from line_slam_ros.kernel_cache import inner, kernel
 
 NO_IMAGE = 1e-18  # |n_C[:2]|^2 / |d|^2 at and below which a line runs through the optical centre along the axis
 
 
-@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+@inner(forceinline=True)
 def _in_body_and_camera(R_WB, p_WB, R_BC, p_BC, n_W, d_W):
     """(n_B, d_B, n_C) as nine numbers."""
     m0 = n_W[0] - (p_WB[1] * d_W[2] - p_WB[2] * d_W[1])
@@ -30,7 +31,7 @@ def _in_body_and_camera(R_WB, p_WB, R_BC, p_BC, n_W, d_W):
     return nb0, nb1, nb2, db0, db1, db2, nc0, nc1, nc2
 
 
-@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+@kernel(forceinline=True)
 def line_residual(R_WB, p_WB, R_BC, p_BC, n_W, d_W, ends, r):
     """line_reprojection without its Jacobians."""
     _, _, _, db0, db1, db2, nc0, nc1, nc2 = _in_body_and_camera(R_WB, p_WB, R_BC, p_BC, n_W, d_W)
@@ -43,7 +44,7 @@ def line_residual(R_WB, p_WB, R_BC, p_BC, n_W, d_W, ends, r):
     return True
 
 
-@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+@kernel(forceinline=True)
 def line_reprojection(R_WB, p_WB, R_BC, p_BC, n_W, d_W, ends, r, J_pose, J_ext, J_line):
     """Signed distances of the observed ends to the projected 3D line, normalised coordinates.
 

@@ -1,13 +1,13 @@
 """Robust losses of a squared whitened residual, compiled."""
 import numpy as np
-from numba import njit
 
+from line_slam_ros.kernel_cache import kernel
 from line_slam_ros.types import Loss
 
 L2, HUBER, CAUCHY = int(Loss.L2), int(Loss.HUBER), int(Loss.CAUCHY)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def robust(loss, s, c2):
     """rho and its derivative (the weight) at s = |r|^2, scale c2 = c^2; the cost of a residual is rho / 2.
 

@@ -18,10 +18,10 @@ from typing import Protocol
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
+from line_slam_ros.kernel_cache import inner, kernel
 from line_slam_ros.types import F64, Calibration
 
 WIDEST_CANVAS = 1.25  # of the received image, on each side of the principal point
@@ -155,7 +155,7 @@ class _Equidistant:
         return x
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _look_up(at, table_at, table):
     """Value of table at a place between those of the growing table_at, linear between; constant beyond them."""
     k = min(max(np.searchsorted(table_at, at), 1), len(table) - 1)
@@ -163,7 +163,7 @@ def _look_up(at, table_at, table):
     return table[k - 1] + min(max(share, 0.0), 1.0) * (table[k] - table[k - 1])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _bend(coefficients, x, y):
     """Distorted x, y and the symmetric derivative dx_d/dx, dx_d/dy = dy_d/dx, dy_d/dy; radtan."""
     k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
@@ -178,7 +178,7 @@ def _bend(coefficients, x, y):
             gain + 2.0 * slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def _distort_radtan(coefficients, widest, x, x_d):
     """Fill x_d (N, 2) from x (N, 2)."""
     k = (coefficients[0], coefficients[1], coefficients[2], coefficients[3], coefficients[4], coefficients[5],
@@ -189,7 +189,7 @@ def _distort_radtan(coefficients, widest, x, x_d):
             x_d[i, 0], x_d[i, 1], _, _, _ = _bend(k, x[i, 0], x[i, 1])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def _undistort_radtan(coefficients, widest, table, table_d, x_d, x):
     """Fill x (N, 2) from x_d (N, 2)."""
     k = (coefficients[0], coefficients[1], coefficients[2], coefficients[3], coefficients[4], coefficients[5],
@@ -209,7 +209,7 @@ def _undistort_radtan(coefficients, widest, table, table_d, x_d, x):
         x[i, 0], x[i, 1] = (u, v) if found else (np.nan, np.nan)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _angle(coefficients, theta):
     """Distorted angle of theta and its derivative; equidistant."""
     k1, k2, k3, k4 = coefficients
@@ -218,7 +218,7 @@ def _angle(coefficients, theta):
             1.0 + s * (3.0 * k1 + s * (5.0 * k2 + s * (7.0 * k3 + s * 9.0 * k4))))
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def _distort_equidistant(coefficients, widest, x, x_d):
     """Fill x_d (N, 2) from x (N, 2)."""
     k = coefficients[0], coefficients[1], coefficients[2], coefficients[3]
@@ -230,7 +230,7 @@ def _distort_equidistant(coefficients, widest, x, x_d):
         x_d[i, 0], x_d[i, 1] = scale * x[i, 0], scale * x[i, 1]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def _undistort_equidistant(coefficients, widest, table, table_d, x_d, x):
     """Fill x (N, 2) from x_d (N, 2)."""
     k = coefficients[0], coefficients[1], coefficients[2], coefficients[3]

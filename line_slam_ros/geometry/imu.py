@@ -7,13 +7,13 @@ acceleration at mid-interval. Error order [rotation, position, velocity].
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from line_slam_ros.geometry.lie_kernels import exp_so3, multiply, right_jacobian
+from line_slam_ros.kernel_cache import inner, kernel
 from line_slam_ros.types import F64, I64, ImuBatch
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def preintegrate(t, gyro, accel, bg, ba, var_g, var_a, dR, dp, dv, J, cov):
     """Relative motion over the samples t (N,) s, gyro and accel (N, 3), with biases bg, ba (3,) removed.
 
@@ -25,9 +25,13 @@ def preintegrate(t, gyro, accel, bg, ba, var_g, var_a, dR, dp, dv, J, cov):
         dp += dv dt + M a dt^2 / 2,  dv += M a dt,  dR <- dR Exp(w dt)
     """
     W, H, Jr, A, M = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    F, G = np.eye(9), np.zeros((9, 6))
+    F, G = np.zeros((9, 9)), np.zeros((9, 6))
     FC, w = np.empty((9, 9)), np.empty(3)
-    dR[:], dp[:], dv[:], J[:], cov[:] = np.eye(3), 0.0, 0.0, 0.0, 0.0
+    for i in range(9):
+        F[i, i] = 1.0
+    dR[:], dp[:], dv[:], J[:], cov[:] = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(3):
+        dR[i, i] = 1.0
     for k in range(len(t) - 1):
         dt = t[k + 1] - t[k]
         a0 = 0.5 * (accel[k, 0] + accel[k + 1, 0]) - ba[0]
@@ -52,11 +56,11 @@ def preintegrate(t, gyro, accel, bg, ba, var_g, var_a, dR, dp, dv, J, cov):
             dp[i] += dv[i] * dt + 0.5 * acc * dt * dt
             dv[i] += acc * dt
         multiply(dR, W, M)
-        dR[:] = M
+        _copy(M, dR)
     return t[len(t) - 1] - t[0]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _transition(W, H, Jr, A, M, dt, F, G):
     """F (9, 9): error before to error after one interval; G (9, 6): by the rate and the specific force."""
     for i in range(3):
@@ -73,7 +77,7 @@ def _transition(W, H, Jr, A, M, dt, F, G):
         F[3 + i, 6 + i] = dt
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _propagate(F, G, var_g, var_a, cov, J, FC):
     """cov <- F cov F' + G diag(var_g, var_a) G' and J <- F J - G, in place; FC (9, 9) is scratch."""
     for i in range(9):
@@ -101,16 +105,26 @@ def _propagate(F, G, var_g, var_a, cov, J, FC):
             J[i, j] = FC[i, j]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
+def _copy(A, B):
+    """B = A for 3x3, by elements: assigning whole arrays makes seconds of compiled error messages."""
+    for i in range(3):
+        for j in range(3):
+            B[i, j] = A[i, j]
+
+
+@kernel
 def turned(t, gyro, bias):
     """R_01 (3, 3): how the body turned over the samples t (N,) s, gyro (N, 3) rad/s, bias (3,) removed."""
-    R, step, by, product = np.eye(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    R, step, by, product = np.zeros((3, 3)), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    for i in range(3):
+        R[i, i] = 1.0
     for k in range(len(t) - 1):
         for i in range(3):
             step[i] = (t[k + 1] - t[k]) * (0.5 * (gyro[k, i] + gyro[k + 1, i]) - bias[i])
         exp_so3(step, by)
         multiply(R, by, product)
-        R[:] = product
+        _copy(product, R)
     return R
 
 

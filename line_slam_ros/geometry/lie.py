@@ -13,9 +13,9 @@ Formulas: Sola, Deray, Atchuthan, "A micro Lie theory for state estimation in ro
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
+from line_slam_ros.kernel_cache import kernel
 from line_slam_ros.types import F64
 
 
@@ -81,7 +81,7 @@ def quaternion_from_matrix(R: ArrayLike) -> F64:
     return q_xyzw
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def _quaternions(R, q_xyzw):
     """Fills q_xyzw (N, 4) from R (N, 3, 3)."""
     column = np.empty(4)

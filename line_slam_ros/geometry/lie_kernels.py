@@ -3,10 +3,11 @@
 Same conventions as lie.py (right perturbation). Nothing here allocates.
 """
 import numpy as np
-from numba import njit
+
+from line_slam_ros.kernel_cache import inner, kernel
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def exp_so3(w, R):
     """Rotation vector w (3,) -> R (3, 3): Rodrigues, Taylor below 1e-4 rad."""
     x, y, z = w[0], w[1], w[2]
@@ -21,7 +22,7 @@ def exp_so3(w, R):
     R[2, 0], R[2, 1], R[2, 2] = c * x * z - s * y, c * y * z + s * x, 1.0 - c * (x * x + y * y)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def log_so3(R, w):
     """R (3, 3) -> rotation vector w (3,), |w| <= pi, through the quaternion of largest component."""
     t = R[0, 0] + R[1, 1] + R[2, 2]
@@ -48,7 +49,7 @@ def log_so3(R, w):
     w[0], w[1], w[2] = k * q0, k * q1, k * q2
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _write_jacobian(w, a, b, J):
     """J = I + a [w]x + b [w]x^2."""
     x, y, z = w[0], w[1], w[2]
@@ -57,7 +58,7 @@ def _write_jacobian(w, a, b, J):
     J[2, 0], J[2, 1], J[2, 2] = b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def right_jacobian(w, J):
     """J_r (3, 3): Exp(w + d) = Exp(w) Exp(J_r d)."""
     a2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
@@ -68,7 +69,7 @@ def right_jacobian(w, J):
         _write_jacobian(w, -(1.0 - np.cos(a)) / a2, (a - np.sin(a)) / (a2 * a), J)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def right_jacobian_inverse(w, J):
     """J_r^-1 (3, 3): Log(Exp(w) Exp(d)) = w + J_r^-1 d."""
     a2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
@@ -79,7 +80,7 @@ def right_jacobian_inverse(w, J):
         _write_jacobian(w, 0.5, 1.0 / a2 - 0.5 / (a * np.tan(0.5 * a)), J)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def multiply(A, B, C):
     """C = A B for 3x3; C must be another buffer."""
     for i in range(3):
@@ -87,7 +88,7 @@ def multiply(A, B, C):
             C[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def multiply_transposed(A, B, C):
     """C = A^T B for 3x3; C must be another buffer."""
     for i in range(3):
@@ -95,7 +96,7 @@ def multiply_transposed(A, B, C):
             C[i, j] = A[0, i] * B[0, j] + A[1, i] * B[1, j] + A[2, i] * B[2, j]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def retract_rotation(R, d, out):
     """out = R Exp(d), put back on SO(3) by one Gram-Schmidt pass; out may be R. Nothing drifts over long runs."""
     E, C = np.empty((3, 3)), np.empty((3, 3))

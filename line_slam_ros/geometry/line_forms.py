@@ -17,9 +17,9 @@ plane. What a form cannot hold is refused by store_line, or NaN after move_line.
 geometry/orthonormal.py and geometry/host_line.py.
 """
 import numpy as np
-from numba import njit
 
 from line_slam_ros.geometry.lie_kernels import retract_rotation
+from line_slam_ros.kernel_cache import inner, kernel
 from line_slam_ros.types import LineForm
 
 VALUES = 11  # numbers that store a line, whatever the form
@@ -29,13 +29,13 @@ LEFT, PLUECKER, ORTH4 = int(LineForm.ORTHONORMAL_LEFT), int(LineForm.PLUECKER), 
 HOST, HOST_FREE = int(LineForm.HOST), int(LineForm.HOST_FREE)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def freedom(form):
     """Numbers of a step: 2 or 4."""
     return 2 if form == HOST else 4
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def world_line(form, values, origin_W, n_W, d_W, J):
     """Line n_W (3,), d_W (3,), of any length, of values (VALUES,) about origin_W (3,), and its tangent J (6, 4).
 
@@ -50,7 +50,7 @@ def world_line(form, values, origin_W, n_W, d_W, J):
     _move_origin(origin_W, n_W, d_W, J)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def move_line(form, values, step, out):
     """out (VALUES,) = values moved by step (4,), of which a form uses the first 2 or all; out may be values."""
     U, turn = np.empty((3, 3)), np.empty(3)
@@ -74,7 +74,7 @@ def move_line(form, values, step, out):
     _keep_frame(form, U, phi + step[3], out)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def store_line(form, n, d, R_WH, ends_H, values):
     """Line n (3,), d (3,) about the origin, axes of W, to values (VALUES,).
 
@@ -91,14 +91,14 @@ def store_line(form, n, d, R_WH, ends_H, values):
     return not np.isnan(values[0])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def store_lines(form, pluecker, R_WH, ends_H, values, ok):
     """store_line for pluecker (L, 6), R_WH (L, 3, 3), ends_H (L, 2, 2): fills values (L, VALUES) and ok (L,)."""
     for i in range(len(pluecker)):
         ok[i] = store_line(form, pluecker[i, :3], pluecker[i, 3:], R_WH[i], ends_H[i], values[i])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def unit_world_line(form, values, origin_W, L, J):
     """L (6,) = [n_W, d_W] with |d_W| = 1 and its tangent J (6, 4): (dL - L (d . dd) / |d|^2) / |d|."""
     world_line(form, values, origin_W, L[:3], L[3:], J)
@@ -111,7 +111,7 @@ def unit_world_line(form, values, origin_W, L, J):
             J[i, j] = (J[i, j] - L[i] * along) / length
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def unit_world_lines(form, values, origin_W):
     """Of values (L, VALUES), origin_W (L, 3): pluecker (L, 6) with |d| = 1 and tangents (L, 6, 4)."""
     L, J = np.empty((len(values), 6)), np.empty((len(values), 6, 4))
@@ -120,7 +120,7 @@ def unit_world_lines(form, values, origin_W):
     return L, J
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def frame_of_line(n, d, U):
     """U (3, 3) of a line and phi, as orthonormal_from_pluecker: the longer of n, d keeps its direction."""
     nn, dd = np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]), np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
@@ -142,7 +142,7 @@ def frame_of_line(n, d, U):
     return np.arctan2(dd, nn)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _frame_of(form, values, U):
     """U (3, 3) and phi of the forms that are kinds of the orthonormal one."""
     if form == PLUECKER:
@@ -159,7 +159,7 @@ def _frame_of(form, values, U):
     return values[3]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _keep_frame(form, U, phi, values):
     """The reverse of _frame_of; values NaN where orth4 is singular."""
     values[:] = 0.0
@@ -177,7 +177,7 @@ def _keep_frame(form, U, phi, values):
         values[9] = phi
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _orthonormal_line(form, U, phi, n, d, J):
     """Line and tangent about the origin: columns [0; w2 u3], [-w1 u3; 0], [w1 u2; -w2 u1], [-w2 u1; w1 u2] by the
     right update; by the left one the first three times U'."""
@@ -195,7 +195,7 @@ def _orthonormal_line(form, U, phi, n, d, J):
                 J[i, j] = a * U[j, 0] + b * U[j, 1] + c * U[j, 2]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _host_line(form, values, n, d, J):
     """Line and tangent about the host's centre; the plane's tilts turn z about x and y."""
     c, s, rho = np.cos(values[9]), np.sin(values[9]), values[10]
@@ -209,7 +209,7 @@ def _host_line(form, values, n, d, J):
         J[i, 3], J[3 + i, 3] = -free * c * x, -free * rho * c * z
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _pin_to_host(n, d, R_WH, ends, U, values):
     """Nearest line in the host's observation plane: rho = |y x d|^2 / ((y x d) . n) is the exact inverse range at
     which the bearing y passes the line. False when that is not in front."""
@@ -232,7 +232,7 @@ def _pin_to_host(n, d, R_WH, ends, U, values):
     return along > 0.0 and values[10] > 1.0 / FURTHEST
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _read(values, U):
     """U (3, 3) of the first nine values."""
     for i in range(3):
@@ -240,7 +240,7 @@ def _read(values, U):
             U[i, j] = values[3 * i + j]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _write(U, values):
     """The first nine values of U (3, 3)."""
     for i in range(3):
@@ -248,7 +248,7 @@ def _write(U, values):
             values[3 * i + j] = U[i, j]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _cross_columns(U):
     """u3 = u1 x u2."""
     U[0, 2] = U[1, 0] * U[2, 1] - U[2, 0] * U[1, 1]
@@ -256,7 +256,7 @@ def _cross_columns(U):
     U[2, 2] = U[0, 0] * U[1, 1] - U[1, 0] * U[0, 1]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _move_origin(origin_W, n_W, d_W, J):
     """(n, d) about origin_W to (n, d) about W's origin, with the tangent: n += origin x d."""
     o0, o1, o2 = origin_W[0], origin_W[1], origin_W[2]
