@@ -158,7 +158,8 @@ class Slam:
         new = ~np.isin(lines.ids, self._mapped)
         for slot, T_WC in enumerate(lines.T_WC):
             given = lines.seen[:, slot] & (new | (slot == newest))
-            self.line_map.observe(lines.ids[given], lines.ends[given, slot], T_WC)
+            if given.any():
+                self.line_map.observe(lines.ids[given], lines.ends[given, slot], T_WC)
         self.line_map.retire(np.setdiff1d(self._mapped, lines.ids))
         self._mapped = lines.ids
 

@@ -9,6 +9,7 @@ from line_slam_ros.geometry.lie import so3_exp, so3_log
 from line_slam_ros.ros_conventions import linear_velocity, pose_covariance, twist_covariance
 from line_slam_ros.types import Status
 from msg_adapters import outputs
+from msg_adapters.estimate_bytes import EstimateBytes
 from msg_adapters.factories import MessageFactory
 
 
@@ -41,6 +42,15 @@ def test_odometry(new):
     np.testing.assert_array_equal(message.pose.covariance, pose_covariance(estimate).ravel())
     np.testing.assert_array_equal(message.twist.covariance, twist_covariance(estimate, 1e-4).ravel())
     assert serialise(message)
+
+
+@pytest.mark.parametrize('frame,body', [('odom', 'imu_link'), ('map', 'b'), ('', 'body'), ('world', 'imu_0')])
+def test_an_estimate_in_bytes_equals_its_messages_serialised(frame, body):
+    new, estimate = samples.factory('bag'), samples.estimate()
+    moved = outputs.transform(new, estimate.t_ns, estimate.T_WB, frame, body)
+    assert EstimateBytes(new, serialise, frame, body)(estimate, 1e-4) == (
+        serialise(outputs.tf(new, [moved])), serialise(outputs.odometry(new, estimate, frame, body, 1e-4)),
+        serialise(outputs.pose(new, estimate, frame)))
 
 
 def test_covariances_follow_the_ros_conventions():

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from line_scene import FOCAL, image, scene
 
-from line_slam_ros.estimation.shift import FEW_CORNERS, segment_shifts
+from line_slam_ros.estimation.shift import FEW_CORNERS, segment_shifts, shared
 from line_slam_ros.estimation.stillness import Stillness
 from line_slam_ros.types import LineObservations, Observations, PointObservations
 
@@ -98,3 +98,11 @@ def test_the_noise_of_a_shift_is_as_told_beyond_the_ends_too(rng):
     noisy = [e + (rng.normal(size=s.shape) * s)[..., None] * across for e, s in ((ends, sigma), (part, sigma_part))]
     size, one = segment_shifts(*noisy, sigma, sigma_part)
     assert np.mean(size**2 / (4.0 * one**2)) == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize('sizes', [(0, 0), (0, 5), (5, 0), (1, 1), (40, 30), (30, 60)])
+def test_shared_ids_are_found_in_both(rng, sizes):
+    a, b = (np.sort(rng.choice(70, size, replace=False)) for size in sizes)
+    i, j = shared(a, b)
+    np.testing.assert_array_equal(a[i], np.intersect1d(a, b))
+    np.testing.assert_array_equal(b[j], np.intersect1d(a, b))

@@ -7,6 +7,7 @@ from typing import Any
 from line_slam_ros.cli.bag_writer import BagWriter
 from line_slam_ros.types import F64, Estimate
 from msg_adapters import outputs
+from msg_adapters.estimate_bytes import EstimateBytes
 from msg_adapters.marker_bytes import LineMarkers
 from msg_adapters.path_bytes import PathBytes
 
@@ -20,7 +21,8 @@ class Recording:
 
     def __init__(self, writer: BagWriter, odom_frame: str, body_frame: str, namespace: str = '/line_slam') -> None:
         self._writer, self._new = writer, writer.new
-        self._odom, self._body, self._namespace = odom_frame, body_frame, namespace
+        self._odom, self._namespace = odom_frame, namespace
+        self._bytes_of = EstimateBytes(writer.new, writer.serialise, odom_frame, body_frame)
         self._markers = LineMarkers(writer.new, writer.serialise, odom_frame, _LINE_WIDTH)
         self._path_of = PathBytes(odom_frame)
         self._path: list[bytes] = []  # poses
@@ -30,11 +32,11 @@ class Recording:
 
     def estimate(self, estimate: Estimate, gyro_variance: float = 0.0) -> None:
         """Odometry, pose and transform."""
-        t_ns, new = estimate.t_ns, self._new
-        moved = outputs.transform(new, t_ns, estimate.T_WB, self._odom, self._body)
-        self._writer.write('/tf', t_ns, outputs.tf(new, [moved]))
-        self._write('odometry', t_ns, outputs.odometry(new, estimate, self._odom, self._body, gyro_variance))
-        self._write('pose', t_ns, outputs.pose(new, estimate, self._odom))
+        t_ns = estimate.t_ns
+        transform, odometry, pose = self._bytes_of(estimate, gyro_variance)
+        self._writer.write_serialised('/tf', t_ns, 'tf2_msgs/msg/TFMessage', transform)
+        self._write_serialised('odometry', t_ns, 'nav_msgs/msg/Odometry', odometry)
+        self._write_serialised('pose', t_ns, 'geometry_msgs/msg/PoseWithCovarianceStamped', pose)
         self._extend_path(t_ns, estimate.T_WB)
 
     def state(self, t_ns: int, slam: Any, counts: Mapping[str, int]) -> None:

@@ -6,6 +6,7 @@ compares with the length of a corner's shift: the same noise, and the same media
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 from line_slam_ros.types import F64, I64, Observations
 
@@ -13,9 +14,23 @@ FEW_CORNERS = 15  # shared by two images; with fewer, segments join in to judge 
 
 
 def shared(a: I64, b: I64) -> tuple[I64, I64]:
-    """Rows (N,), (N,) of the ids that both have."""
-    _, i, j = np.intersect1d(a, b, assume_unique=True, return_indices=True)
-    return i, j
+    """Rows (N,), (N,) of the ids that both have; the ids of each rise."""
+    i, j = np.empty((2, min(len(a), len(b))), np.int64)
+    count = _shared(a, b, i, j)
+    return i[:count], j[:count]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _shared(a, b, i, j):
+    """Fill i and j with the rows of rising a and b where they are equal; how many there are."""
+    count, q = 0, 0
+    for p in range(len(a)):
+        while q < len(b) and b[q] < a[p]:
+            q += 1
+        if q < len(b) and b[q] == a[p]:
+            i[count], j[count] = p, q
+            count += 1
+    return count
 
 
 def matches(a: Observations, b: Observations) -> tuple[F64, F64]:
@@ -26,7 +41,7 @@ def matches(a: Observations, b: Observations) -> tuple[F64, F64]:
 
 def corner_shifts(then: F64, now: F64) -> F64:
     """Distances (N,) between bearings then and now (N, 2)."""
-    return np.linalg.norm(now - then, axis=1)
+    return np.hypot(*(now - then).T)
 
 
 def segment_shifts(then: F64, now: F64, sigma_then: F64, sigma_now: F64) -> tuple[F64, F64]:

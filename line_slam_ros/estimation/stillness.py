@@ -46,7 +46,7 @@ class Stillness:
         """Corners judge; where they are few, segments join in, unless they would not see every direction of motion."""
         corners = corner_shifts(*matches(then, now)) / self._allowed(self._point_sigma)
         if len(corners) >= FEW_CORNERS:
-            return bool(np.median(corners) > 1.0)
+            return bool(2 * np.count_nonzero(corners > 1.0) > len(corners))
         i, j = shared(then.lines.ids, now.lines.ids)
         size, sigma = segment_shifts(then.lines.ends[i], now.lines.ends[j], then.lines.sigma[i], now.lines.sigma[j])
         both = np.concatenate([corners, size / self._allowed(sigma)])

@@ -95,18 +95,23 @@ def inside(shape, u, v, A):
         and v + reach_v < shape[0] - 2.0 and reach_u < FARTHEST and reach_v < FARTHEST
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
-def bend(pairs, shape, u, v, A, base, moved):
-    """Fill moved (AREA,) with grey minus base at (u, v) + A (x, y), last column 0. It must be inside().
+@njit(cache=True, nogil=True, error_model='numpy')
+def workspace():
+    """Buffers of align(): the warped patch and what bend() needs, right-hand side, step."""
+    return (np.empty(3 * AREA, np.float32), np.empty(AREA, np.int32), np.empty(2 * AREA, np.uint16),
+            np.empty(7), np.empty(6))
 
-    pairs: neighbours() of the image of this shape.
+
+@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+def bend(image, u, v, A, base, moved, index, greys):
+    """Fill moved[:AREA] with grey of image (H, W) minus base at (u, v) + A (x, y), last column 0. It must be inside().
+
+    moved (3 AREA,), index (AREA,), greys (2 AREA,): the rest is work space; each loop only reads or only computes.
     """
-    w = shape[1]
-    index, tops, lows = np.empty(AREA, np.int32), np.empty(AREA, np.uint16), np.empty(AREA, np.uint16)
-    right, down = np.empty(AREA, np.float32), np.empty(AREA, np.float32)
+    flat, one, below = image.reshape(-1), np.uintp(1), np.uintp(image.shape[1])
     first_u, first_v = int(u) - FARTHEST, int(v) - FARTHEST  # small numbers from there on: exact enough in 32 bits
-    at_u, at_v, width = np.float32(u - first_u), np.float32(v - first_v), np.int32(w)
-    corner, below = first_v * w + first_u, np.uintp(w)
+    at_u, at_v, width = np.float32(u - first_u), np.float32(v - first_v), np.int32(image.shape[1])
+    corner = first_v * image.shape[1] + first_u
     a00, a01 = np.float32(A[0, 0] * RADIUS), np.float32(A[0, 1] * RADIUS)
     a10, a11 = np.float32(A[1, 0] * RADIUS), np.float32(A[1, 1] * RADIUS)
     byte, shift = np.uint16(255), np.uint16(8)
@@ -114,15 +119,18 @@ def bend(pairs, shape, u, v, A, base, moved):
         x, y = at_u + a00 * RIGHT[k] + a01 * DOWN[k], at_v + a10 * RIGHT[k] + a11 * DOWN[k]
         c, r = np.int32(x), np.int32(y)
         index[k] = r * width + c
-        right[k], down[k] = x - np.float32(c), y - np.float32(r)
+        moved[AREA + k], moved[2 * AREA + k] = x - np.float32(c), y - np.float32(r)
     for k in range(AREA):
-        at = np.uintp(index[k] + corner)
-        tops[k], lows[k] = pairs[at], pairs[at + below]
+        here = np.uintp(index[k] + corner)
+        low = here + below  # compilers make one read of each two
+        greys[k] = np.uint16(flat[here]) | np.uint16(flat[here + one]) << shift
+        greys[AREA + k] = np.uint16(flat[low]) | np.uint16(flat[low + one]) << shift
     for k in range(AREA):
-        a, b = np.float32(np.int32(tops[k] & byte)), np.float32(np.int32(tops[k] >> shift))
-        c, d = np.float32(np.int32(lows[k] & byte)), np.float32(np.int32(lows[k] >> shift))
-        top, low = a + right[k] * (b - a), c + right[k] * (d - c)
-        moved[k] = (top + down[k] * (low - top) - base) * INSIDE[k]
+        tops, lows, right = greys[k], greys[AREA + k], moved[AREA + k]
+        a, b = np.float32(np.int32(tops & byte)), np.float32(np.int32(tops >> shift))
+        c, d = np.float32(np.int32(lows & byte)), np.float32(np.int32(lows >> shift))
+        top, low = a + right * (b - a), c + right * (d - c)
+        moved[k] = (top + moved[2 * AREA + k] * (low - top) - base) * INSIDE[k]
 
 
 @njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
@@ -167,16 +175,17 @@ def improve(uv, A, d):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def align(pairs, shape, template, moments, inverse, uv, A, moved, right, d):
+def align(image, template, moments, inverse, uv, A, work):
     """Align a learned patch with the image by an affine warp: the guesses uv (2,) and A (2, 2) are improved in place.
 
-    Returns their correlation, 0 when the patch left the image. moved (AREA,), right (7,), d (6,): work space.
+    Returns their correlation, 0 when the patch left the image. work: workspace().
     """
+    moved, index, greys, right, d = work
     n, base, energy, score = SIZE * SIZE, np.float32(moments[1, 0]), moments[0, 0], 0.0
     for _ in range(STEPS):
-        if not inside(shape, uv[0], uv[1], A):
+        if not inside(image.shape, uv[0], uv[1], A):
             return 0.0
-        bend(pairs, shape, uv[0], uv[1], A, base, moved)
+        bend(image, uv[0], uv[1], A, base, moved, index, greys)
         total, squares = projections(template, moved, right)
         score = right[0] / np.sqrt(max((squares - total * total / n) * energy, 1.0))
         gain = right[0]

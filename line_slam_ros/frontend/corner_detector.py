@@ -71,13 +71,15 @@ def spread(score, tracked, count, min_distance, cell):
             held[int(tracked[i, 1] / cell) * columns + int(tracked[i, 0] / cell)] += 1
             block(near, 0.5 * tracked[i, 0], 0.5 * tracked[i, 1], 0.5 * min_distance)
     at, value = np.empty((h * w // 4, 2), np.int64), np.empty(h * w // 4)
-    n = 0
+    n, zero, top = 0, np.float32(0.0), np.empty(w, np.bool_)
     for y in range(MARGIN, h - MARGIN):
+        up, row, low, free = score[y - 1], score[y], score[y + 1], near[y]
+        for x in range(MARGIN, w - MARGIN):  # without a branch, which would be mispredicted
+            s = row[x]
+            top[x] = (s > zero) & free[x] & (s > row[x - 1]) & (s >= row[x + 1]) & (s > up[x]) & (s >= low[x])
         for x in range(MARGIN, w - MARGIN):
-            s = score[y, x]
-            if s > 0.0 and near[y, x] and s > score[y, x - 1] and s >= score[y, x + 1] and s > score[y - 1, x] \
-                    and s >= score[y + 1, x]:
-                at[n, 0], at[n, 1], value[n] = x, y, s
+            if top[x]:
+                at[n, 0], at[n, 1], value[n] = x, y, row[x]
                 n += 1
     order = np.argsort(-value[:n])
     rank = np.empty(n, np.int64)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from line_slam_ros.frontend.edge_sampling import PLACE, SAMPLES, place, sample
+from line_slam_ros.frontend.edge_sampling import PLACES, SAMPLES, SEEN, place, sample
 
 HALF = 6  # px, half length of a remembered profile
 WIDTH = 2 * HALF + 1
@@ -23,34 +23,40 @@ INERTIA = 0.002  # loss of correlation per px that a farther place must make up 
 DIM = np.float32(5.0)  # grey, norm of a profile below which its correlation counts little
 LOST = 0.3  # support below which an edge is not measured on
 END_STEP, INWARD, OUTWARD, GAP = 2.0, 22.0, 8.0, 3  # px, px, px, steps: how an end looks for where its edge ends
+ROWS = 2 * PEAK + 5  # of work space: as many as rows of grey from which an edge is chosen
 CLEAR = 0.4  # of the mean height of an edge, below which it ends
 ALONG = np.array([2.0 * (i + 0.5) / SAMPLES - 1.0 for i in range(SAMPLES)], np.float32)  # of the samples, -1 to 1
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def workspace():
-    """Buffers for one segment at a time: places, which are seen, grey, correlations, peaks (offset, height, merit)."""
-    return (np.empty((PLACE, SAMPLES), np.float32), np.empty(SAMPLES, np.float32),
-            np.empty((2 * FULL + 1, SAMPLES), np.float32), np.zeros((SAMPLES // TOGETHER, LANES), np.float32),
-            np.empty((3, SAMPLES), np.float32))
+    """Buffers for one segment at a time: places, which of them are seen (a part of places), grey, correlations, peaks
+    (offset, height, merit), rows of other numbers; indices and pairs of neighbours for sampling."""
+    places = np.empty(PLACES, np.float32)
+    return (places, places[SEEN:SEEN + SAMPLES], np.empty((2 * FULL + 1, SAMPLES), np.float32),
+            np.zeros((SAMPLES // TOGETHER, LANES), np.float32), np.empty((3, SAMPLES), np.float32),
+            np.empty((ROWS, SAMPLES), np.float32), np.empty(SAMPLES, np.int32), np.empty(2 * SAMPLES, np.uint16))
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def strip(view, ends, half, work):
-    """Grey across a segment (2, 2) into work. view: neighbours() of the image, its shape, the lens."""
+    """Grey across a segment (2, 2) into work. view: the image and the table of the lens."""
     du, dv = ends[1, 0] - ends[0, 0], ends[1, 1] - ends[0, 1]
     length = np.sqrt(du * du + dv * dv) + 1e-12
-    pairs, shape, lens = view
-    at, seen, values = work[0], work[1], work[2]
+    (image, lens), places, index = view, work[0], work[6]
     du, dv, nu, nv = du / SAMPLES, dv / SAMPLES, -dv / length, du / length
-    place(lens, shape, ends[0, 0] + 0.5 * du, ends[0, 1] + 0.5 * dv, du, dv, nu, nv, half, 0, SAMPLES, at, seen)
-    sample(pairs, shape[1], at, half, values)
+    place(lens, image.shape, ends[0, 0] + 0.5 * du, ends[0, 1] + 0.5 * dv, du, dv, nu, nv, half, 0, SAMPLES, places,
+          index)
+    sample(image, places, half, work[2], index, work[7])
 
 
 @njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
-def normalise(values, seen, profile):
-    """Fill profile (WIDTH, SAMPLES) with the columns of values, zero mean and unit norm (0 where not seen)."""
-    total, square, zero = np.empty(SAMPLES, np.float32), np.empty(SAMPLES, np.float32), np.float32(0.0)
+def normalise(values, seen, profile, rows):
+    """Fill profile (WIDTH, SAMPLES) with the columns of values, zero mean and unit norm (0 where not seen).
+
+    rows (2 and more, SAMPLES): work space.
+    """
+    total, square, zero = rows[0], rows[1], np.float32(0.0)
     total[:] = zero
     square[:] = zero
     for k in range(WIDTH):
@@ -69,14 +75,13 @@ def normalise(values, seen, profile):
 
 
 @njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
-def correlate(values, seen, profile, count, table):
+def correlate(values, seen, profile, count, table, rows):
     """Correlations of profile (WIDTH, SAMPLES) with values from row j < count on into table, TOGETHER of them summed.
 
     table (SAMPLES / TOGETHER, LANES). Negative ones count 0, as does a sample that cannot be compared. Returns the
-    number of samples that can.
+    number of samples that can. rows (4 and more, SAMPLES): work space.
     """
-    total, square = np.empty(SAMPLES, np.float32), np.empty(SAMPLES, np.float32)
-    weight, product = np.empty(SAMPLES, np.float32), np.empty(SAMPLES, np.float32)
+    total, square, weight, product = rows[0], rows[1], rows[2], rows[3]
     zero, share = np.float32(0.0), np.float32(1.0 / WIDTH)
     total[:] = zero
     square[:] = zero
@@ -109,13 +114,13 @@ def correlate(values, seen, profile, count, table):
 
 
 @njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
-def best_shift(table, usable, reach, tilt):
+def best_shift(table, usable, reach, tilt, total):
     """(mean correlation, a, b) of the best displacement a + b s, s from -1 to 1 along the rows of table.
 
-    |a| <= reach, |b| <= tilt; the columns of table are displacements from -(reach + tilt) on.
+    |a| <= reach, |b| <= tilt; the columns of table are displacements from -(reach + tilt) on. total (LANES,): work
+    space.
     """
     lanes = LANES - 2 * FAR_TILT
-    total = np.empty(lanes, np.float32)
     best, best_a, best_b = np.float32(-1.0), 0, 0
     for b in range(-tilt, tilt + 1):
         total[:] = np.float32(0.0)
@@ -135,10 +140,10 @@ def best_shift(table, usable, reach, tilt):
 def search(view, profile, ends, reach, tilt, work):
     """(mean correlation, a, b) where a profile fits best across predicted ends (2, 2); 0 if under half can be seen."""
     strip(view, ends, reach + tilt + HALF, work)
-    usable = correlate(work[2], work[1], profile, 2 * (reach + tilt) + 1, work[3])
+    usable = correlate(work[2], work[1], profile, 2 * (reach + tilt) + 1, work[3], work[5])
     if usable < SAMPLES // 2:
         return 0.0, 0, 0
-    return best_shift(work[3], usable, reach, tilt)
+    return best_shift(work[3], usable, reach, tilt, work[5][0])
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -154,22 +159,22 @@ def shift(ends, first, second):
 
 
 @njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
-def peaks(values, seen, first, reach, floor, found):
+def peaks(values, seen, first, reach, floor, found, block):
     """Strongest rising edge in rows first + reach + 2 +- reach of each column of values, near the middle by preference.
 
-    first (SAMPLES,); found (3, SAMPLES) <- offset from that row, height (0: none), merit.
+    first (SAMPLES,); found (3, SAMPLES) <- offset from that row, height (0: none), merit. block (ROWS, SAMPLES): work
+    space.
     """
     zero, half, one = np.float32(0.0), np.float32(0.5), np.float32(1.0)
-    narrow, block = one / np.float32(reach + 1), np.empty((5, SAMPLES), np.float32)
+    narrow = one / np.float32(reach + 1)
     found[:] = zero
+    for i in range(SAMPLES):
+        for k in range(2 * reach + 5):
+            block[k, i] = values[np.uintp(first[i] + k), i]
     for k in range(2 * reach + 1):
         for i in range(SAMPLES):
-            row = np.uintp(first[i] + k)
-            for p in range(5):
-                block[p, i] = values[row + np.uintp(p), i]
-        for i in range(SAMPLES):
-            before, g = half * (block[2, i] - block[0, i]), half * (block[3, i] - block[1, i])
-            after = half * (block[4, i] - block[2, i])
+            before, g = half * (block[k + 2, i] - block[k, i]), half * (block[k + 3, i] - block[k + 1, i])
+            after = half * (block[k + 4, i] - block[k + 2, i])
             curvature = before - g - g + after
             t = np.float32(k - reach) + half * (before - after) / min(curvature, np.float32(-1e-6))
             near = one - half * (t * narrow) * (t * narrow)
@@ -224,7 +229,7 @@ def measure(view, floor, half, a, b, ends, work):
     first, line = np.empty(SAMPLES, np.int64), np.zeros(6)
     for i in range(SAMPLES):
         first[i] = half - PEAK - 2 + a + int(np.floor(b * ALONG[i] + 0.5))
-    peaks(values, seen, first, PEAK, np.float32(floor), found)
+    peaks(values, seen, first, PEAK, np.float32(floor), found, work[5])
     for i in range(SAMPLES):
         found[0, i] += first[i] - (half - PEAK - 2 + a) - b * ALONG[i]
     fit(found, 1.0, line)
@@ -233,7 +238,7 @@ def measure(view, floor, half, a, b, ends, work):
     shift(ends, a + line[0] - b - line[1], a + line[0] + b + line[1])
     strip(view, ends, 3, work)
     first[:] = 0
-    peaks(values, seen, first, 1, np.float32(floor), found)
+    peaks(values, seen, first, 1, np.float32(floor), found, work[5])
     fit(found, 0.5, line)
     if line[4] >= LOST:
         shift(ends, line[0] - line[1], line[0] + line[1])
@@ -246,14 +251,13 @@ def reach_ends(view, ends, floor, work):
     du, dv = ends[1, 0] - ends[0, 0], ends[1, 1] - ends[0, 1]
     length = np.sqrt(du * du + dv * dv) + 1e-12
     tu, tv = du / length, dv / length
-    pairs, shape, lens = view
-    at, seen, values = work[0], work[1], work[2]
+    (image, lens), places, seen, values, index = view, work[0], work[1], work[2], work[6]
     start, lanes = -min(INWARD, 0.4 * length), SAMPLES // 2
     for side, sign in enumerate((-1.0, 1.0)):
         u, v = ends[side, 0] + sign * start * tu, ends[side, 1] + sign * start * tv
-        place(lens, shape, u, v, sign * END_STEP * tu, sign * END_STEP * tv, -tv, tu, 3, side * lanes,
-              (side + 1) * lanes, at, seen)
-    sample(pairs, shape[1], at, 3, values)
+        place(lens, image.shape, u, v, sign * END_STEP * tu, sign * END_STEP * tv, -tv, tu, 3, side * lanes,
+              lanes, places, index)
+    sample(image, places, 3, values, index, work[7])
     for side, sign in enumerate((-1.0, 1.0)):
         last, missed = start, 0
         for k in range(lanes):
@@ -274,7 +278,7 @@ def reach_ends(view, ends, floor, work):
 def remember(view, ends, profile, work):
     """Fill profile (WIDTH, SAMPLES) of a segment (2, 2)."""
     strip(view, ends, HALF, work)
-    normalise(work[2], work[1], profile)
+    normalise(work[2], work[1], profile, work[5])
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

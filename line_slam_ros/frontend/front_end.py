@@ -23,7 +23,7 @@ class FrontEnd:
         self._camera, self._config = camera, config
         self._points = PointTracker(camera, config.points)
         self._lines = LineTracker(camera, config.lines)
-        self._image = np.zeros((camera.calibration.height, camera.calibration.width), np.uint8)
+        self._image, self._before = np.zeros((2, camera.calibration.height, camera.calibration.width), np.uint8)
         self._t_ns, self._elapsed_ns = 0, 0
         self.timings: dict[str, float] = {}
 
@@ -47,14 +47,16 @@ class FrontEnd:
         if frame.image.shape != self._image.shape:
             (h, w), (rows, columns) = self._image.shape, frame.image.shape[:2]
             raise ValueError(f'image is {columns}x{rows} px, the calibration is for {w}x{h}: use the one that fits')
-        self._image = frame.image.copy(order='C')  # it is needed again when the next one comes
+        self._image, self._before = self._before, self._image
+        np.copyto(self._image, frame.image)  # it is needed again when the next one comes
         R_CnCp = None if R_CnCp is None else np.ascontiguousarray(R_CnCp, float)
         times, pace = [perf_counter()], self._pace(frame.t_ns)
         if self._config.use_points:
             self._points.track(self._image, R_CnCp, pace)
         if self._config.use_lines:
             self._lines.take(self._image)
-            self._lines.track(R_CnCp, self._points.x_turned, self._points.motion_x, pace)
+            corners = self._points.corners
+            self._lines.track(R_CnCp, corners.x - corners.motion, corners.motion, pace)
         times.append(perf_counter())
         looked = self._config.use_lines and self._lines.detect(skip_detection)
         if self._config.use_points:

@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from line_slam_ros.config import Lines
 from line_slam_ros.frontend import edge_kernels as edge
-from line_slam_ros.frontend.edge_sampling import LENS_STEP, SAMPLES, neighbours
+from line_slam_ros.frontend.edge_sampling import LENS_STEP, SAMPLES
 from line_slam_ros.frontend.line_detector import detect
 from line_slam_ros.frontend.rows import Rows
 from line_slam_ros.frontend.segment_kernels import buffers
 from line_slam_ros.frontend.segment_sets import duplicates
+from line_slam_ros.frontend.smoothing import smooth
 from line_slam_ros.geometry.camera import Camera
 from line_slam_ros.types import F64, I64, U8, LineObservations
 
@@ -59,7 +60,8 @@ class LineTracker:
         self.canvas, self._half_canvas = camera.rectified(), camera.rectified(0.5)
         self._work = buffers(*self._half_canvas.size[::-1])
         self._image = np.zeros((camera.calibration.height, camera.calibration.width), np.uint8)  # smoothed
-        self._view = neighbours(self._image), self._image.shape, self._lens_table(camera)  # what the kernels look at
+        self._row = np.empty(camera.calibration.width + 4, np.uint16)
+        self._view = self._image, self._lens_table(camera)  # what the kernels look at
         self._profiles = np.empty((config.max_count, edge.WIDTH, SAMPLES), np.float32)
         self._next_id = 0
         self.reset()
@@ -88,7 +90,7 @@ class LineTracker:
 
     def take(self, image: U8) -> None:
         """Take the newest image (H, W), as received."""
-        cv2.GaussianBlur(image, (3, 3), 0, dst=self._image)
+        smooth(image, self._row, self._image)
 
     def track(self, R_CnCp: F64 | None, x: F64, motion_x: F64, pace: float = 1.0) -> None:
         """Move every track into the newest image.

@@ -102,21 +102,22 @@ def prepare(patch, J, sums):
     middle, zero = patch[RADIUS + 1, RADIUS + 1], np.float32(0.0)
     g = u = v = gg = gu = gv = uu = uv = vv = zero
     for y in range(SIZE):
-        up, row, low = patch[y], patch[y + 1], patch[y + 2]
-        grey, by_u, by_v = J[0, y * LANES:], J[1, y * LANES:], J[2, y * LANES:]
         for x in range(LANES):
-            a = (row[x + 1] - middle) * INSIDE[x]
-            b, c = HALF * (row[x + 2] - row[x]) * INSIDE[x], HALF * (low[x + 1] - up[x + 1]) * INSIDE[x]
-            grey[x], by_u[x], by_v[x] = a, b, c
-            g += a
-            u += b
-            v += c
-            gg += a * a
-            gu += a * b
-            gv += a * c
-            uu += b * b
-            uv += b * c
-            vv += c * c
+            k = y * LANES + x
+            J[0, k] = (patch[y + 1, x + 1] - middle) * INSIDE[x]
+            J[1, k] = HALF * (patch[y + 1, x + 2] - patch[y + 1, x]) * INSIDE[x]
+            J[2, k] = HALF * (patch[y + 2, x + 1] - patch[y, x + 1]) * INSIDE[x]
+    for k in range(AREA):  # not row by row: sums across are dear
+        a, b, c = J[0, k], J[1, k], J[2, k]
+        g += a
+        u += b
+        v += c
+        gg += a * a
+        gu += a * b
+        gv += a * c
+        uu += b * b
+        uv += b * c
+        vv += c * c
     sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7], sums[8] = g, u, v, gg, gu, gv, uu, uv, vv
 
 
@@ -138,10 +139,10 @@ def products(image, c, r, a, b, base, J):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def slide(previous, current, u0, v0, M, u, v, patch, J):
+def slide(previous, current, u0, v0, M, u, v, settled, patch, J):
     """Translate (u, v) in current until it shows what previous shows at (u0, v0) + M (x, y).
 
-    patch (SIZE + 2, LANES + 2), J (3, AREA): work space. Returns (ok, u, v).
+    settled: px^2, a smaller step is the last. patch (SIZE + 2, LANES + 2), J (3, AREA): work space. Returns (ok, u, v).
     """
     turned = max(abs(M[0, 0] - 1.0), abs(M[0, 1]), abs(M[1, 0]), abs(M[1, 1] - 1.0)) > STRAIGHT
     if not (warp(previous, u0, v0, M, RADIUS + 1, np.float32(0.0), patch) if turned else
@@ -169,22 +170,23 @@ def slide(previous, current, u0, v0, M, u, v, patch, J):
         gain = min(max((bt - along_u * du - along_v * dv) / energy, 0.5), 2.0)
         du, dv = du / gain, dv / gain
         u, v = u - du, v - dv
-        if du * du + dv * dv < SETTLED:
+        if du * du + dv * dv < settled:
             break
     return True, u, v
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def descend(previous, newest, start, M, uv, lowest, patch, J):
+def descend(previous, newest, start, M, uv, lowest, settled, patch, J):
     """Improve a guess uv (2,), in place, by translation, from the coarsest pyramid level to lowest; False: not found.
 
     What is at uv + x in the newest image is at start + M x in the previous one. Only level 0 has to have an answer.
+    settled: px^2 of a level, see slide().
     """
     good = True
     for level in range(len(previous) - 1 if lowest > 0 else 0, lowest - 1, -1):
         scale = 0.5**level
         good, u, v = slide(previous[level], newest[level], start[0] * scale, start[1] * scale, M, uv[0] * scale,
-                           uv[1] * scale, patch, J)
+                           uv[1] * scale, settled, patch, J)
         if good:
             uv[0], uv[1] = u / scale, v / scale
     return good or lowest > 0

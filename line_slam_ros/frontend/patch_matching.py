@@ -4,12 +4,13 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from line_slam_ros.frontend.affine_kernels import align
-from line_slam_ros.frontend.patch_kernels import AREA, LANES, SIZE, descend
+from line_slam_ros.frontend.affine_kernels import align, workspace
+from line_slam_ros.frontend.patch_kernels import AREA, LANES, SETTLED, SIZE, descend
 
 SAME_PATCH = 0.85  # correlation above which a patch still shows what it showed when it was learned
 STRAY_PX = 1.5  # the learned patch must be found this near to where the previous image puts it
 FAITH_PX = 3.0  # or this near to where it is expected by its motion
+DECIDED = 0.2  # of the distance allowed after the way back: the steps after a smaller one decide nothing
 SMALLEST, LARGEST = 0.5, 2.0  # range of the area ratio for which the learned patch is kept
 
 
@@ -39,7 +40,7 @@ def predict(R, x, motion, pace, x_turned, x_expected, turns):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def match(previous, newest, pairs, start, turns, rotated, moved_on, slots, templates, moments, inverses, round_trip,
+def match(previous, newest, start, turns, rotated, moved_on, slots, templates, moments, inverses, round_trip,
           border, uv, shapes, found):
     """Find the patches that were at start (N, 2) in the previous image in the newest one.
 
@@ -49,9 +50,9 @@ def match(previous, newest, pairs, start, turns, rotated, moved_on, slots, templ
     is as far from the rim as border px and the way back ends within round_trip px.
     """
     patch, J = np.zeros((SIZE + 2, LANES + 2), np.float32), np.empty((3, AREA), np.float32)
-    moved, right, d, guess, back = np.empty(AREA, np.float32), np.empty(7), np.empty(6), np.empty(2), np.empty(2)
-    A, M, here = np.empty((2, 2)), np.empty((2, 2)), np.empty(2)
-    image_shape = newest[0].shape
+    A, M, here, guess, back = np.empty((2, 2)), np.empty((2, 2)), np.empty(2), np.empty(2), np.empty(2)
+    image, work = newest[0], workspace()
+    (height, width), near_enough = image.shape, (DECIDED * round_trip)**2
     for i in range(len(start)):
         slot, T, found[i] = slots[i], turns[i], 0
         determinant = T[0, 0] * T[1, 1] - T[0, 1] * T[1, 0]
@@ -62,22 +63,22 @@ def match(previous, newest, pairs, start, turns, rotated, moved_on, slots, templ
             if not abs(guess[0] + guess[1]) < np.inf:
                 guess[:] = start[i]
             if way == 1:
-                descend(previous, newest, start[i], M, guess, 1, patch, J)
+                descend(previous, newest, start[i], M, guess, 1, SETTLED, patch, J)
             here[:] = guess
             for p in range(2):
                 for q in range(2):
                     A[p, q] = T[p, 0] * shapes[i, 0, q] + T[p, 1] * shapes[i, 1, q]
-            score = align(pairs, image_shape, templates[slot], moments[slot], inverses[slot], here, A, moved, right, d)
+            score = align(image, templates[slot], moments[slot], inverses[slot], here, A, work)
             found[i] = shows_the_same(score, here, guess, FAITH_PX if way == 0 else STRAY_PX, A)
             if found[i]:
                 break
         if found[i] == 0:
             here[:] = guess
-            if not descend(previous, newest, start[i], M, here, 0, patch, J):
+            if not descend(previous, newest, start[i], M, here, 0, SETTLED, patch, J):
                 continue
             found[i], A[0, 0], A[0, 1], A[1, 0], A[1, 1] = 2, 1.0, 0.0, 0.0, 1.0
         uv[i], shapes[i], back[:] = here, A, start[i]
-        good = border < here[0] < image_shape[1] - 1.0 - border and border < here[1] < image_shape[0] - 1.0 - border
-        good = good and descend(newest, previous, here, T, back, 0, patch, J)
+        good = border < here[0] < width - 1.0 - border and border < here[1] < height - 1.0 - border
+        good = good and descend(newest, previous, here, T, back, 0, near_enough, patch, J)
         if not (good and (back[0] - start[i, 0])**2 + (back[1] - start[i, 1])**2 < round_trip * round_trip):
             found[i] = 0

@@ -3,18 +3,18 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from itertools import pairwise
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from line_slam_ros.config import Points
 from line_slam_ros.frontend.affine_kernels import learn
 from line_slam_ros.frontend.corner_detector import new_corners
-from line_slam_ros.frontend.edge_sampling import neighbours
 from line_slam_ros.frontend.patch_kernels import AREA, RADIUS
 from line_slam_ros.frontend.patch_matching import match, predict
 from line_slam_ros.frontend.rows import Rows
+from line_slam_ros.frontend.smoothing import halve
 from line_slam_ros.frontend.two_view import static_matches
 from line_slam_ros.geometry.camera import Camera
 from line_slam_ros.types import F64, I64, U8, PointObservations
@@ -69,15 +69,15 @@ class PointTracker:
         self._learned = (np.empty((config.max_count, 3, AREA), np.float32),
                          np.empty((config.max_count, 2, 7)), np.empty((config.max_count, 6, 6)))
         self._next_id = 0
+        size = camera.calibration.height, camera.calibration.width
+        self._row = np.empty(size[1] + 4, np.uint16)
+        self._halves = [halves(size), halves(size)]  # of the newest image, and of the one before
         self.reset()
 
     def reset(self) -> None:
         """Forget every track; ids go on counting."""
         self.corners = Corners.blank(0)
-        self._image: U8 | None = None
-        self._pyramid: tuple[U8, ...] = ()
-        self.x_turned: F64 = np.empty((0, 2))  # where the rotation alone would have put the corners of the newest image
-        self.motion_x: F64 = np.empty((0, 2))  # and what is left
+        self._pyramid: tuple[U8, ...] = ()  # of the newest image
         self._past: deque[_Past] = deque(maxlen=LOOK_BACK)
         self._R_CnC0 = np.eye(3)
 
@@ -95,7 +95,10 @@ class PointTracker:
 
         pace: time since the previous image, in units of that before it.
         """
-        previous, self._pyramid, self._image = self._pyramid, pyramid(image), image
+        previous, self._pyramid = self._pyramid, (image, *self._halves[0])
+        self._halves.reverse()
+        for level, half in pairwise(self._pyramid):
+            halve(level, self._row, half)
         if not len(self.corners):
             return
         before, n = self.corners, len(self.corners)
@@ -103,16 +106,15 @@ class PointTracker:
         predict(np.eye(3) if R_CnCp is None else R_CnCp, before.x, before.motion, pace, x_turned[:n], x_turned[n:],
                 turns)
         expected, uv, found = self._camera.project(x_turned), np.empty((n, 2)), np.empty(n, np.int64)
-        match(previous, self._pyramid, neighbours(image), before.uv, turns, expected[:n], expected[n:], before.slots,
+        match(previous, self._pyramid, before.uv, turns, expected[:n], expected[n:], before.slots,
               *self._learned, self._config.round_trip_px, BORDER, uv, before.shapes, found)
         relearn = found == 2
         learn(image, uv, before.slots, *self._learned, relearn)
         uv[(found == 0) | (found == 2) & ~relearn] = np.nan
         x = self._camera.normalise(uv)
         index = self._static(before.ids, before.x, x, np.flatnonzero(np.isfinite(x[:, 0])), R_CnCp)
-        self.x_turned = x_turned[index]
-        self.motion_x = x[index] - self.x_turned
-        self.corners = Corners(before.ids[index], before.ages[index] + 1, uv[index], x[index], self.motion_x,
+        x = x[index]
+        self.corners = Corners(before.ids[index], before.ages[index] + 1, uv[index], x, x - x_turned[index],
                                before.shapes[index], before.slots[index])
 
     def detect(self, wait: bool = False) -> None:
@@ -120,20 +122,21 @@ class PointTracker:
         count = self._config.max_count
         if len(self.corners) > (FEW if wait else REFILL) * count or count == 0:
             return
-        cell = float(np.sqrt(self._image.size / count))
-        uv = new_corners(self._image, self._pyramid[1], self.corners.uv, count - len(self.corners),
+        image, half_size = self._pyramid[:2]
+        cell = float(np.sqrt(image.size / count))
+        uv = new_corners(image, half_size, self.corners.uv, count - len(self.corners),
                          self._config.min_distance_px, cell, self._config.min_contrast)
         fresh = Corners.blank(len(uv))
         fresh.uv, fresh.x, good = uv, self._camera.normalise(uv), np.ones(len(uv), np.bool_)
         fresh.slots = np.setdiff1d(np.arange(count), self.corners.slots)[:len(uv)]
-        learn(self._image, uv, fresh.slots, *self._learned, good)
+        learn(image, uv, fresh.slots, *self._learned, good)
         fresh = fresh.select(good & self._inside(uv) & np.isfinite(fresh.x).all(axis=1))
         fresh.ids = np.arange(self._next_id, self._next_id + len(fresh))
         self._next_id += len(fresh)
         self.corners = self.corners.extended(fresh)
 
     def _inside(self, uv: F64) -> NDArray[np.bool_]:
-        h, w = self._image.shape
+        h, w = self._pyramid[0].shape
         return ((uv > BORDER) & (uv < np.array([w, h]) - 1.0 - BORDER)).all(axis=1)
 
     def _static(self, ids: I64, x_before: F64, x: F64, index: I64, R_CnCp: F64 | None) -> I64:
@@ -147,14 +150,13 @@ class PointTracker:
             known = np.flatnonzero(past.ids[then] == ids[index]) if len(past.ids) else np.empty(0, np.int64)
             keep, _ = static_matches(past.x[then[known]], x[index[known]], self._R_CnC0 @ past.R_CnC0.T, GYRO_SIGMA,
                                      2.0 * threshold)
-            index = np.delete(index, known[~keep])
+            static = np.ones(len(index), np.bool_)
+            static[known] = keep
+            index = index[static]
         self._past.append(_Past(ids[index], x[index], self._R_CnC0))
         return index
 
 
-def pyramid(image: U8) -> tuple[U8, ...]:
-    """Images, each half the size of the one before."""
-    levels = [image]
-    for _ in range(LEVELS - 1):
-        levels.append(cv2.pyrDown(levels[-1]))
-    return tuple(levels)
+def halves(size: tuple[int, int]) -> tuple[U8, ...]:
+    """Memory for the upper levels of a pyramid, each half the size (height, width) of the one before."""
+    return tuple(np.empty([-(-side // 2**level) for side in size], np.uint8) for level in range(1, LEVELS))

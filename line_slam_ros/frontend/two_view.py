@@ -15,7 +15,9 @@ from line_slam_ros.types import F64
 
 FEWEST = 8  # matches; fewer than this cannot contradict each other
 HYPOTHESES = 60
-REFINEMENTS = 4
+BLOCK = 64  # matches after which a hypothesis that is worse already is given up
+REFINEMENTS = 4  # at most
+SETTLED = 1e-3  # of the threshold: a smaller step is the last
 UNKNOWN_ROTATION = 0.05  # rad, what is left uncertain after the rotation has been fitted to the matches
 
 
@@ -78,13 +80,17 @@ def _epipolar_distance(X, x2, t):
 
 
 @njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
-def _cost(X, x2, t, limit):
-    """Sum of squared distances, limit at most, of x2 (2, N) to the lines t x X of turned rays X (3, N)."""
-    total = 0.0
-    for k in range(X.shape[1]):
-        n0, n1, n2 = t[1] * X[2, k] - t[2] * X[1, k], t[2] * X[0, k] - t[0] * X[2, k], t[0] * X[1, k] - t[1] * X[0, k]
-        e = n0 * x2[0, k] + n1 * x2[1, k] + n2
-        total += min(e * e / max(n0 * n0 + n1 * n1, 1e-24), limit)
+def _cost(X, x2, t, limit, best):
+    """Sum of squared distances, limit at most, of x2 (2, N) to the lines t x X of turned rays X (3, N); as soon as it
+    exceeds best, any number that does."""
+    n, total = X.shape[1], 0.0
+    for first in range(0, n, BLOCK):
+        for k in range(first, min(first + BLOCK, n)):
+            n0, n1 = t[1] * X[2, k] - t[2] * X[1, k], t[2] * X[0, k] - t[0] * X[2, k]
+            e = n0 * x2[0, k] + n1 * x2[1, k] + t[0] * X[1, k] - t[1] * X[0, k]
+            total += min(e * e / max(n0 * n0 + n1 * n1, 1e-24), limit)
+        if total > best:
+            break
     return total
 
 
@@ -113,7 +119,7 @@ def _consensus(x1, x2, threshold, rotation_sigma, R, keep):
         if length < 1e-14:
             continue
         guess /= length
-        cost = _cost(X, seen, guess, 4.0 * threshold * threshold)
+        cost = _cost(X, seen, guess, 4.0 * threshold * threshold, best)
         if cost < best:
             best = cost
             t[:] = guess
@@ -169,3 +175,6 @@ def _refine(x1, x2, threshold, rotation_sigma, R, t):
         retract_rotation(R, d[:3], R)
         t += d[3] * e1 + d[4] * e2
         t /= np.sqrt(np.sum(t * t))
+        if d[0] * d[0] + d[1] * d[1] + d[2] * d[2] < SETTLED * SETTLED * threshold * threshold \
+                and d[3] * d[3] + d[4] * d[4] < SETTLED * SETTLED:
+            break

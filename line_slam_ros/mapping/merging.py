@@ -104,20 +104,27 @@ def _merge(landmarks, namesakes, kept, near, gone, changed, stays):
             line_ends, fused_ends = fused_ends, line_ends
             if _widen(line_ends, low, high):
                 count = within(low - reach, high + reach, kept_ends, rows)
-        k = namesakes[i]
-        if k >= 0 and not gone[k] and line_id == ids[i]:
-            if line_sigma >= kept_sigma[k]:
-                continue
-            gone[k] = True
-        keeps = True
-        for j in range(i):
-            if not away[j] and to_ids[j] == line_id:
-                keeps = line_sigma < to_sigma[j]
-                away[j] = keeps
-        if keeps:
+        namesake = namesakes[i] if line_id == ids[i] else -1
+        if _prevails(i, line_id, line_sigma, namesake, kept_sigma, gone, to_ids, to_sigma, away):
             to_pluecker[i], to_cov[i], to_ends[i] = line, line_cov, line_ends
             to_ids[i], to_views[i], to_sigma[i], away[i] = line_id, line_views, line_sigma, False
     stays[:] = ~away
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _prevails(i, line_id, line_sigma, namesake, kept_sigma, gone, to_ids, to_sigma, away):
+    """Whether landmark i is more certain than the others of its id, which then go: the kept row namesake (-1: none) and
+    landmarks before it."""
+    if namesake >= 0 and not gone[namesake]:
+        if line_sigma >= kept_sigma[namesake]:
+            return False
+        gone[namesake] = True
+    prevails = True
+    for j in range(i):
+        if not away[j] and to_ids[j] == line_id:
+            prevails = line_sigma < to_sigma[j]
+            away[j] = prevails
+    return prevails
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
