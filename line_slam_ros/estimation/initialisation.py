@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numba import njit
 from scipy.optimize import brentq, least_squares
 
 from line_slam_ros.estimation.shift import matches
 from line_slam_ros.geometry.imu import preintegrate
 from line_slam_ros.geometry.lie import so3_exp
 from line_slam_ros.geometry.lie_kernels import exp_so3, multiply, multiply_transposed
+from line_slam_ros.kernel_cache import inner, kernel
 from line_slam_ros.types import F64, ImuNoise, Observations, Samples
 
 BIAS_STEP = 1e-4  # rad/s, of the difference quotient
@@ -104,7 +104,7 @@ def _chain(links: list[tuple[float, F64, F64, F64, F64]]) -> _Motion:
     return _Motion(np.array(t), np.array(R), np.array(p), np.array(v))
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _coplanarity(x, y, R):
     """Smallest eigenvalue of the scatter of f x R f' per match, x, y (N, 2); 0 when the bearings agree with R."""
     M = np.zeros((3, 3))
@@ -123,7 +123,7 @@ def _coplanarity(x, y, R):
     return max(np.linalg.eigvalsh(M)[0], 0.0) / max(len(x), 1)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def _disagreement(bias, x, y, first, dR, J, R_BC):
     """Root coplanarity (P,) of P frame pairs, rotations corrected for a gyro bias (3,).
 

@@ -7,11 +7,11 @@ with joint), as a general solver would.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from line_slam_ros.factors.line_reprojection import line_reprojection
 from line_slam_ros.factors.robust import CAUCHY, robust
 from line_slam_ros.geometry.line_forms import VALUES, freedom, move_line, unit_world_line, world_line
+from line_slam_ros.kernel_cache import inner, kernel
 
 DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e8  # of the diagonal: at the start, at least, when giving up
 CONVERGED = 1e-6  # relative decrease of the cost
@@ -19,7 +19,7 @@ BLIND = 1e6  # squared residual of a view in which the line has no image
 CHI2_MEDIAN = 1.386  # of chi-square with two degrees of freedom
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def fit_lines(form, loss, c2, joint, first, last, poses, ends, sigma, values, origin, iterations, tolerance, cost,
               steps):
     """Fit line i to its views first[i] <= k < last[i].
@@ -41,7 +41,7 @@ def fit_lines(form, loss, c2, joint, first, last, poses, ends, sigma, values, or
                                      iterations, tolerance, e2[own])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def fit_line(form, loss, c2, poses, ends, sigma, values, origin, iterations, tolerance, e2):
     """One line; returns its cost and the number of steps taken. e2 (K,) is scratch."""
     size = freedom(form)
@@ -63,7 +63,7 @@ def fit_line(form, loss, c2, poses, ends, sigma, values, origin, iterations, tol
     return cost, taken
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _fit_jointly(form, loss, c2, first, last, poses, ends, sigma, values, origin, iterations, tolerance, cost, steps):
     """All lines with one damping; a step is taken by all or by none."""
     size, lines = freedom(form), len(first)
@@ -92,7 +92,7 @@ def _fit_jointly(form, loss, c2, first, last, poses, ends, sigma, values, origin
     steps[:] = taken
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def refine_lines(rows, form, poses, ends, sigma, count, values, origin, c2, iterations, gate, pluecker, cov, outliers):
     """Fit the lines in rows of a table to all their views, with Cauchy loss, starting from their present values.
 
@@ -114,7 +114,7 @@ def refine_lines(rows, form, poses, ends, sigma, count, values, origin, c2, iter
         _covariance(H, J, freedom(form), max(1.0, _median(e2[views], sorted_e2) / CHI2_MEDIAN), cov[i])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def normal_equations(form, loss, c2, poses, ends, sigma, values, origin, H, g, e2):
     """Of one line from K views: leading rows of H (4, 4), g (4,) and e2 (K,), the squared whitened residuals.
 
@@ -150,7 +150,7 @@ def normal_equations(form, loss, c2, poses, ends, sigma, values, origin, H, g, e
     return 0.5 * cost
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _median(values, buffer):
     """Median of values (N,), N > 0, by insertion into the buffer."""
     for k in range(len(values)):
@@ -162,7 +162,7 @@ def _median(values, buffer):
     return 0.5 * (buffer[len(values) // 2] + buffer[(len(values) - 1) // 2])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _solve(H, damping, g, size, step):
     """step[:m] = -(H + damping diag H)^-1 g by Cholesky, on the leading m = size rows of H (4, 4), g (4,)."""
     L = np.empty((4, 4))
@@ -186,7 +186,7 @@ def _solve(H, damping, g, size, step):
         step[a] = s / L[a, a]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _covariance(H, J, size, factor, cov):
     """cov (6, 6) = factor J H^-1 J' of the leading m = size columns of J (6, 4)."""
     column, x = np.empty(4), np.empty(4)

@@ -2,11 +2,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from line_slam_ros.estimation.triangulation import has_parallax, plane_variance
 from line_slam_ros.geometry.lie import rigid, rigid_inverse
 from line_slam_ros.geometry.lines import line_from_many_planes, observation_plane, transform_lines, trim
+from line_slam_ros.kernel_cache import kernel
 from line_slam_ros.types import F64, I64
 
 MOST_VIEWS = 32  # evenly chosen when there are more
@@ -36,7 +36,7 @@ def start_from_planes(poses: F64, ends: F64, sigma: F64, count: I64, min_sine: f
     return lines, origin, _parallax(planes, ends, sigma, np.minimum(count, views), min_sine) & in_front
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def _parallax(planes, ends, sigma, count, min_sine):
     """Which lines (M,) have it in their first count (M,) views of planes (M, K, 4)."""
     found, noise2 = np.empty(len(planes), np.bool_), np.empty(planes.shape[1])

@@ -6,8 +6,8 @@ compares with the length of a corner's shift: the same noise, and the same media
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from line_slam_ros.kernel_cache import kernel
 from line_slam_ros.types import F64, I64, Observations
 
 FEW_CORNERS = 15  # shared by two images; with fewer, segments join in to judge the motion
@@ -20,7 +20,7 @@ def shared(a: I64, b: I64) -> tuple[I64, I64]:
     return i[:count], j[:count]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def _shared(a, b, i, j):
     """Fill i and j with the rows of rising a and b where they are equal; how many there are."""
     count, q = 0, 0

@@ -1,14 +1,14 @@
 """First 3D estimates of points and lines from the window's poses, compiled."""
 import numpy as np
-from numba import njit
 
 from line_slam_ros.geometry.line_forms import store_line, world_line
+from line_slam_ros.kernel_cache import inner, kernel
 
 NEAREST = 0.05  # m from the camera: where a line that is seen cannot be
 SIGNIFICANT = 5.0  # standard deviations of an angle between observation planes that noise does not explain
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def camera_pose(R_WB, p_WB, R_BC, p_BC, R_WC, p_WC):
     """T_WC = T_WB T_BC, written into R_WC (3, 3), p_WC (3,)."""
     for i in range(3):
@@ -18,7 +18,7 @@ def camera_pose(R_WB, p_WB, R_BC, p_BC, R_WC, p_WC):
             R_WC[i, j] = R_WB[i, 0] * R_BC[0, j] + R_WB[i, 1] * R_BC[1, j] + R_WB[i, 2] * R_BC[2, j]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def start_points(n, R, p, R_BC, p_BC, todo, seen, z, sigma, abr, R_WA, p_WA, rho0, w_rho, solved):
     """Anchored inverse depth of the rows in todo, from the first view that saw them.
 
@@ -58,7 +58,7 @@ def start_points(n, R, p, R_BC, p_BC, todo, seen, z, sigma, abr, R_WA, p_WA, rho
             solved[i] = True
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def start_lines(n, R, p, R_BC, p_BC, todo, seen, z, sigma, min_sine, form, values, origin, solved):
     """Lines of the rows in todo, in any form (geometry/line_forms.py), from all observation planes (multi-view SVD).
 
@@ -78,7 +78,8 @@ def start_lines(n, R, p, R_BC, p_BC, todo, seen, z, sigma, min_sine, form, value
                 continue
             camera_pose(R[f], p[f], R_BC, p_BC, R_WC, p_WC)
             if views == 0:
-                origin[i] = p_WC
+                for k in range(3):
+                    origin[i, k] = p_WC[k]
             a, b = z[i, f, 0], z[i, f, 1]
             h[0], h[1], h[2] = a[1] - b[1], b[0] - a[0], a[0] * b[1] - a[1] * b[0]
             s = 1.0 / np.sqrt(h[0] * h[0] + h[1] * h[1] + h[2] * h[2])
@@ -101,14 +102,14 @@ def start_lines(n, R, p, R_BC, p_BC, todo, seen, z, sigma, min_sine, form, value
             solved[i] = store_line(form, nd[:3], nd[3:], R_WC, z[i, first], values[i])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def plane_variance(ends, sigma):
     """Variance (rad^2) of a segment's plane about its bearing; ends (2, 2), normalised, with noise sigma (2,)."""
     a, b = ends[0], ends[1]
     return (sigma[0] ** 2 + sigma[1] ** 2) / ((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def has_parallax(normals, noise2, views, min_sine):
     """Whether two of the unit normals (views, 3), blind to their signs, differ by more than min_sine and significantly.
 
@@ -123,7 +124,7 @@ def has_parallax(normals, noise2, views, min_sine):
     return False
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _line_through(A, B, nd):
     """Points A, B (4,) -> nd (6,) = [n, d]; False without direction or, as no camera sees it, through the origin."""
     nd[0], nd[1], nd[2] = A[1] * B[2] - A[2] * B[1], A[2] * B[0] - A[0] * B[2], A[0] * B[1] - A[1] * B[0]
@@ -133,7 +134,7 @@ def _line_through(A, B, nd):
     return dd > 1e-9 and nn > 1e-6 * dd
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _in_front(n, R, p, R_BC, p_BC, seen, z, nd, origin):
     """Whether every view sees the feet of its observed ends on line nd (6,) about the origin at positive depth."""
     R_WC, p_WC, n_C, d_C = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
@@ -160,7 +161,7 @@ def _in_front(n, R, p, R_BC, p_BC, seen, z, nd, origin):
     return True
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def lines_in_cameras(n, R, p, R_BC, p_BC, solved, seen, form, values, origin, inside):
     """Mark in inside (M,) the solved lines that are nearer than NEAREST to a camera that saw them.
 

@@ -7,11 +7,11 @@ in the equations come first, then those of the slots (state_row).
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from line_slam_ros.geometry.imu import preintegrate
 from line_slam_ros.geometry.lie_kernels import log_so3, multiply_transposed
 from line_slam_ros.geometry.line_forms import VALUES
+from line_slam_ros.kernel_cache import kernel
 from line_slam_ros.types import F64, I64, ImuNoise, Samples
 
 REST_S = 2.0  # longer at rest, the accelerometer only ties tilt and bias ever tighter: too stiff to solve, nothing new
@@ -21,13 +21,13 @@ POSE = 6  # the part of a state that a camera sees
 RIG = 7  # [rotation and position of the camera in the body, time offset]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def state_row(slot):
     """First row of a slot's state in the equations."""
     return RIG + STATE * slot
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def state_difference(n, R, p, v, b, R0, p0, v0, b0, delta):
     """Fill the rows of the states of delta with present state minus first estimate, rotation as Log(R0' R)."""
     E = np.empty((3, 3))
@@ -42,7 +42,7 @@ def state_difference(n, R, p, v, b, R0, p0, v0, b0, delta):
             delta[o + 9 + i] = b[k, i] - b0[k, i]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def rig_difference(R_BC, p_BC, delay, R_given, p_given, delta):
     """delta (7,) = present rig minus the given one, which has no delay."""
     E = np.empty((3, 3))
@@ -53,7 +53,7 @@ def rig_difference(R_BC, p_BC, delay, R_given, p_given, delta):
     delta[6] = delay[0]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def whiten(cov, W):
     """W = L^-1 with L L' = cov, both (9, 9): W' W = cov^-1."""
     L = np.linalg.cholesky(cov + 1e-14 * np.eye(9))

@@ -10,7 +10,6 @@ and two numbers each correct their products with the image for not being orthogo
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from line_slam_ros.frontend.patch_kernels import (
     AREA,
@@ -25,13 +24,14 @@ from line_slam_ros.frontend.patch_kernels import (
     dot,
     gradient,
 )
+from line_slam_ros.kernel_cache import inner, kernel
 
 STIFFNESS = 50.0  # a weak belief that the shape does not change
 STEPS = 5  # iterations at most
 FARTHEST = 32  # px, reach of a warped patch
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+@inner(fastmath=True)
 def steepest(patch, J, moments):
     """Fill J (7, AREA) of a patch: its grey without mean, then the images of the parameters.
 
@@ -58,7 +58,7 @@ def steepest(patch, J, moments):
             image[k] = (image[k] - mean - share * grey[k]) * INSIDE[k]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def learn(image, uv, slots, templates, moments, inverses, ok):
     """Remember the patches at uv (N, 2) of the rows with ok (N,), which becomes False where it is not possible.
 
@@ -86,7 +86,7 @@ def learn(image, uv, slots, templates, moments, inverses, ok):
             inverses[slot] = np.linalg.inv(H)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def inside(shape, u, v, A):
     """Does a patch at (u, v) + A (x, y) lie in the image, and not too far apart?"""
     reach_u = RADIUS * (abs(A[0, 0]) + abs(A[0, 1]))
@@ -95,14 +95,14 @@ def inside(shape, u, v, A):
         and v + reach_v < shape[0] - 2.0 and reach_u < FARTHEST and reach_v < FARTHEST
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def workspace():
     """Buffers of align(): the warped patch and what bend() needs, right-hand side, step."""
     return (np.empty(3 * AREA, np.float32), np.empty(AREA, np.int32), np.empty(2 * AREA, np.uint16),
             np.empty(7), np.empty(6))
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+@inner(fastmath=True)
 def bend(image, u, v, A, base, moved, index, greys):
     """Fill moved[:AREA] with grey of image (H, W) minus base at (u, v) + A (x, y), last column 0. It must be inside().
 
@@ -133,7 +133,7 @@ def bend(image, u, v, A, base, moved, index, greys):
         moved[k] = (top + moved[2 * AREA + k] * (low - top) - base) * INSIDE[k]
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+@inner(fastmath=True)
 def projections(template, moved, right):
     """Fill right (7,) with products of the grey and of the 6 Jacobian images with moved; (sum, squares) of moved."""
     zero = np.float32(0.0)
@@ -155,7 +155,7 @@ def projections(template, moved, right):
     return total, squares
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def improve(uv, A, d):
     """Compose the map x -> uv + A x, in place, with the inverse of x -> x + D x + d; False if that is degenerate.
 
@@ -174,7 +174,7 @@ def improve(uv, A, d):
     return True
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def align(image, template, moments, inverse, uv, A, work):
     """Align a learned patch with the image by an affine warp: the guesses uv (2,) and A (2, 2) are improved in place.
 

@@ -3,8 +3,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
 
+from line_slam_ros.kernel_cache import kernel
 from line_slam_ros.types import F64, U8
 
 WINDOW = 2  # px, half side of the window of the structure tensor, on the half-size image
@@ -28,7 +28,7 @@ def new_corners(image: U8, half_size: U8, tracked: F64, count: int, min_distance
     return refined.reshape(-1, 2).astype(np.float64)
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+@kernel(fastmath=True)
 def corner_score(image, floor, score):
     """Fill score (H, W) with the mean smaller eigenvalue (grey / px)^2 where it exceeds floor, 0 elsewhere."""
     h, w = image.shape
@@ -59,7 +59,7 @@ def corner_score(image, floor, score):
             score[centre, x] = smaller if smaller > floor else np.float32(0.0)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def spread(score, tracked, count, min_distance, cell):
     """Corners (N, 2) in full-size px: local maxima of score, the emptiest cells first, min_distance apart."""
     h, w = score.shape
@@ -82,15 +82,22 @@ def spread(score, tracked, count, min_distance, cell):
                 at[n, 0], at[n, 1], value[n] = x, y, row[x]
                 n += 1
     order = np.argsort(-value[:n])
-    rank = np.empty(n, np.int64)
+    rank, first = np.empty(n, np.int64), np.zeros(held.max() + n + 2, np.int64)
     for k in range(n):
         home = int(2 * at[order[k], 1] / cell) * columns + int(2 * at[order[k], 0] / cell)
         rank[k] = held[home]
         held[home] += 1
+        first[rank[k] + 1] += 1
+    for r in range(1, len(first)):  # of rank r, by counting
+        first[r] += first[r - 1]
+    by_rank = np.empty(n, np.int64)
+    for k in range(n):
+        by_rank[first[rank[k]]] = order[k]
+        first[rank[k]] += 1
     chosen = np.empty((min(count, n), 2))
     m = 0
-    for k in np.argsort(rank, kind='mergesort'):
-        x, y = at[order[k]]
+    for k in by_rank:
+        x, y = at[k]
         if m == len(chosen):
             break
         if near[y, x]:
@@ -100,7 +107,7 @@ def spread(score, tracked, count, min_distance, cell):
     return chosen[:m]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def block(near, u, v, radius):
     """Clear the disc of radius around (u, v) in near (H, W)."""
     h, w = near.shape

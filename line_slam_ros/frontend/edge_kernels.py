@@ -6,9 +6,9 @@ on the side of its normal (-t_v, t_u), which fixes the order of its ends.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from line_slam_ros.frontend.edge_sampling import PLACES, SAMPLES, SEEN, place, sample
+from line_slam_ros.kernel_cache import inner, kernel
 
 HALF = 6  # px, half length of a remembered profile
 WIDTH = 2 * HALF + 1
@@ -28,7 +28,7 @@ CLEAR = 0.4  # of the mean height of an edge, below which it ends
 ALONG = np.array([2.0 * (i + 0.5) / SAMPLES - 1.0 for i in range(SAMPLES)], np.float32)  # of the samples, -1 to 1
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def workspace():
     """Buffers for one segment at a time: places, which of them are seen (a part of places), grey, correlations, peaks
     (offset, height, merit), rows of other numbers; indices and pairs of neighbours for sampling."""
@@ -38,7 +38,7 @@ def workspace():
             np.empty((ROWS, SAMPLES), np.float32), np.empty(SAMPLES, np.int32), np.empty(2 * SAMPLES, np.uint16))
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def strip(view, ends, half, work):
     """Grey across a segment (2, 2) into work. view: the image and the table of the lens."""
     du, dv = ends[1, 0] - ends[0, 0], ends[1, 1] - ends[0, 1]
@@ -50,7 +50,7 @@ def strip(view, ends, half, work):
     sample(image, places, half, work[2], index, work[7])
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+@kernel(fastmath=True)
 def normalise(values, seen, profile, rows):
     """Fill profile (WIDTH, SAMPLES) with the columns of values, zero mean and unit norm (0 where not seen).
 
@@ -74,7 +74,7 @@ def normalise(values, seen, profile, rows):
             profile[k, i] *= square[i]
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+@inner(fastmath=True)
 def correlate(values, seen, profile, count, table, rows):
     """Correlations of profile (WIDTH, SAMPLES) with values from row j < count on into table, TOGETHER of them summed.
 
@@ -113,7 +113,7 @@ def correlate(values, seen, profile, count, table, rows):
     return int(usable)
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+@inner(fastmath=True)
 def best_shift(table, usable, reach, tilt, total):
     """(mean correlation, a, b) of the best displacement a + b s, s from -1 to 1 along the rows of table.
 
@@ -136,7 +136,7 @@ def best_shift(table, usable, reach, tilt, total):
     return best + INERTIA * (abs(best_a) + 2 * abs(best_b)), best_a, best_b
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def search(view, profile, ends, reach, tilt, work):
     """(mean correlation, a, b) where a profile fits best across predicted ends (2, 2); 0 if under half can be seen."""
     strip(view, ends, reach + tilt + HALF, work)
@@ -146,7 +146,7 @@ def search(view, profile, ends, reach, tilt, work):
     return best_shift(work[3], usable, reach, tilt, work[5][0])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def shift(ends, first, second):
     """Move the two ends (2, 2) along the segment's normal, in place."""
     du, dv = ends[1, 0] - ends[0, 0], ends[1, 1] - ends[0, 1]
@@ -158,7 +158,7 @@ def shift(ends, first, second):
     ends[1, 1] += second * nv
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+@inner(fastmath=True)
 def peaks(values, seen, first, reach, floor, found, block):
     """Strongest rising edge in rows first + reach + 2 +- reach of each column of values, near the middle by preference.
 
@@ -184,7 +184,7 @@ def peaks(values, seen, first, reach, floor, found, block):
             found[2, i] = g * near if better else found[2, i]
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+@kernel(fastmath=True)
 def fit(found, scale, line):
     """Robust displacement a + b s of samples found (3, SAMPLES) with height > 0 (Cauchy weights of scale px).
 
@@ -218,7 +218,7 @@ def fit(found, scale, line):
     line[3] = variance * (w2 - w1 - w1 + w0) / determinant
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def measure(view, floor, half, a, b, ends, work):
     """Put a segment (2, 2) on the edge itself, in place; (support, variances px^2 of its ends, height of the edge).
 
@@ -245,7 +245,7 @@ def measure(view, floor, half, a, b, ends, work):
     return line[4], line[2], line[3], line[5]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def reach_ends(view, ends, floor, work):
     """Let both ends grow (OUTWARD at most) or shrink to where the edge is visible, in place."""
     du, dv = ends[1, 0] - ends[0, 0], ends[1, 1] - ends[0, 1]
@@ -274,20 +274,20 @@ def reach_ends(view, ends, floor, work):
         ends[side, 1] += sign * last * tv
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def remember(view, ends, profile, work):
     """Fill profile (WIDTH, SAMPLES) of a segment (2, 2)."""
     strip(view, ends, HALF, work)
     normalise(work[2], work[1], profile, work[5])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def length_of(ends):
     """px of one segment (2, 2)."""
     return np.hypot(ends[1, 0] - ends[0, 0], ends[1, 1] - ends[0, 1])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def turn(R, focals, centre, ends, turned):
     """Fill turned (M, 2, 2) px with where segments ends (M, 2, 2) are after rotation R (3, 3) of a pinhole camera."""
     for m in range(len(ends)):
@@ -298,7 +298,7 @@ def turn(R, focals, centre, ends, turned):
                 turned[m, k, p] = (R[p, 0] * u + R[p, 1] * v + R[p, 2]) / z * focals[p] + centre[p]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def follow(view, floor, same, on_edge, shortest, slots, profiles, ends, motion, variance, good):
     """Carry predicted segments ends (M, 2, 2), in place, to where their profiles fit best and put them on their edges.
 
@@ -327,7 +327,7 @@ def follow(view, floor, same, on_edge, shortest, slots, profiles, ends, motion, 
             remember(view, end, profile, work)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def settle(view, floor, on_edge, shortest, wanted, ends, variance, good):
     """Put new segments ends (M, 2, 2) on their edges, in place, until as many as wanted are; see follow()."""
     work, half, count = workspace(), PEAK + 2, 0
@@ -343,7 +343,7 @@ def settle(view, floor, on_edge, shortest, wanted, ends, variance, good):
             count += good[m]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def learn(view, ends, slots, profiles):
     """Fill rows slots (M,) of profiles (capacity, WIDTH, SAMPLES) with those of segments ends (M, 2, 2)."""
     work = workspace()

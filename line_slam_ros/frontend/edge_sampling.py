@@ -8,7 +8,8 @@ Numbers of the samples lie one after the other in a single array, so that compil
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from line_slam_ros.kernel_cache import kernel
 
 LENS_STEP = 4  # px, of the table of the lens; between, it is linear to 0.01 px
 BORDER = 4.0  # px of the received image that are not trusted
@@ -19,7 +20,7 @@ A, B, NEAR, FAR = (SAMPLES * k for k in (5, 6, 7, 11))  # the rest is work space
 PLACES = SAMPLES * 15
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def place(lens, shape, u, v, du, dv, nu, nv, half, first, count, places, index):
     """Where samples (u, v) + k (du, dv), k < count, of the canvas lie in the received image of this shape.
 
@@ -64,7 +65,7 @@ def place(lens, shape, u, v, du, dv, nu, nv, half, first, count, places, index):
         places[SEEN + i] = one if good else zero
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+@kernel(fastmath=True)
 def sample(image, places, half, values, index, greys):
     """Fill values (2 half + 1, SAMPLES) with bilinear grey of image (H, W) at places + k steps, |k| <= half.
 

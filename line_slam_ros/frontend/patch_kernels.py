@@ -14,7 +14,8 @@ Rows of work space are LANES wide, one more than SIZE, which processors like; th
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from line_slam_ros.kernel_cache import inner, kernel
 
 RADIUS = 7  # px
 SIZE = 2 * RADIUS + 1
@@ -29,7 +30,7 @@ DOWN, RIGHT = ((np.mgrid[:SIZE, :LANES] - RADIUS) / RADIUS).astype(np.float32).r
 INSIDE = (RIGHT <= 1.0).astype(np.float32)
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+@kernel(fastmath=True)
 def cut(image, u, v, patch):
     """Fill patch (SIZE + 2, LANES + 2) with bilinear grey around (u, v); False when it leaves the image."""
     h, w = image.shape
@@ -45,7 +46,7 @@ def cut(image, u, v, patch):
     return True
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+@inner(fastmath=True)
 def warp(image, u, v, A, radius, base, moved):
     """Fill moved (2 radius + 1, 2 radius + 1 and more) with grey minus base at (u, v) + A (x, y).
 
@@ -72,7 +73,7 @@ def warp(image, u, v, A, radius, base, moved):
     return True
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+@kernel(fastmath=True)
 def dot(a, b):
     """Sum of products of two flat images (AREA,)."""
     total = np.float32(0.0)
@@ -81,7 +82,7 @@ def dot(a, b):
     return total
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+@inner(fastmath=True)
 def gradient(patch, J):
     """Fill J[:3] (3, AREA) with the grey of a patch and its derivatives by u and v."""
     for y in range(SIZE):
@@ -93,7 +94,7 @@ def gradient(patch, J):
             by_v[x] = HALF * (low[x + 1] - up[x + 1])
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+@inner(fastmath=True)
 def prepare(patch, J, sums):
     """Fill J (3, AREA) with the grey of a patch, less that of its middle, and its derivatives; 0 in the last column.
 
@@ -121,7 +122,7 @@ def prepare(patch, J, sums):
     sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7], sums[8] = g, u, v, gg, gu, gv, uu, uv, vv
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+@kernel(fastmath=True)
 def products(image, c, r, a, b, base, J):
     """Products of J (3, AREA) with the grey, less base, around (c + a, r + b), and the sum of that grey."""
     s0 = s1 = s2 = total = np.float32(0.0)
@@ -138,7 +139,7 @@ def products(image, c, r, a, b, base, J):
     return s0, s1, s2, total
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def slide(previous, current, u0, v0, M, u, v, settled, patch, J):
     """Translate (u, v) in current until it shows what previous shows at (u0, v0) + M (x, y).
 
@@ -175,7 +176,7 @@ def slide(previous, current, u0, v0, M, u, v, settled, patch, J):
     return True, u, v
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def descend(previous, newest, start, M, uv, lowest, settled, patch, J):
     """Improve a guess uv (2,), in place, by translation, from the coarsest pyramid level to lowest; False: not found.
 

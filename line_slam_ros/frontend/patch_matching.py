@@ -2,10 +2,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from line_slam_ros.frontend.affine_kernels import align, workspace
 from line_slam_ros.frontend.patch_kernels import AREA, LANES, SETTLED, SIZE, descend
+from line_slam_ros.kernel_cache import inner, kernel
 
 SAME_PATCH = 0.85  # correlation above which a patch still shows what it showed when it was learned
 STRAY_PX = 1.5  # the learned patch must be found this near to where the previous image puts it
@@ -14,7 +14,7 @@ DECIDED = 0.2  # of the distance allowed after the way back: the steps after a s
 SMALLEST, LARGEST = 0.5, 2.0  # range of the area ratio for which the learned patch is kept
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def shows_the_same(score, uv, guess, reach, A):
     """Is the learned patch there, near enough to the guess and not too much deformed?"""
     area = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
@@ -22,7 +22,7 @@ def shows_the_same(score, uv, guess, reach, A):
         and SMALLEST < area < LARGEST
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def predict(R, x, motion, pace, x_turned, x_expected, turns):
     """Where normalised points x (N, 2) are after the rotation R of the camera, and with pace times their motion (N, 2).
 
@@ -39,7 +39,7 @@ def predict(R, x, motion, pace, x_turned, x_expected, turns):
                 turns[i, p, q] = (R[p, q] - x_turned[i, p] * R[2, q]) / z
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def match(previous, newest, start, turns, rotated, moved_on, slots, templates, moments, inverses, round_trip,
           border, uv, shapes, found):
     """Find the patches that were at start (N, 2) in the previous image in the newest one.

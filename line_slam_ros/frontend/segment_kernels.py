@@ -7,7 +7,8 @@ are enough.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from line_slam_ros.kernel_cache import inner, kernel
 
 FLAT = np.float32(5.2)  # grey/px: below, rounding of the grey values alone turns the gradient by more than ALIKE
 ALIKE = np.float32(16.0)  # 1/256 turns between the gradients of one edge and their mean: 22.5 degrees
@@ -15,7 +16,7 @@ TURN = np.float32(256.0 / (2.0 * np.pi))  # 1/256 turns per rad
 STRONGEST = 255
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def buffers(height, width):
     """Work space of segments() for images of this size: strength, angle, crests; places in order, of a region.
 
@@ -26,7 +27,7 @@ def buffers(height, width):
             np.empty(height * width, np.int32))
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+@kernel(fastmath=True)
 def gradients(image, strength, angle):
     """Fill strength (H, W), grey/px, and angle (H, W), 1/256 turns but 1 for 0, at (x + 0.5, y + 0.5); 0 where flat.
 
@@ -51,7 +52,7 @@ def gradients(image, strength, angle):
             way[x] = np.uint8(np.int32(edge * max(turn * TURN, one)) & 255)
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+@inner(fastmath=True)
 def crests(strength, angle, crest):
     """Fill crest (H, W) with angle where strength is largest across the edge, by rows or columns, and 0 elsewhere."""
     h, w = strength.shape
@@ -63,7 +64,7 @@ def crests(strength, angle, crest):
             out[x] = way[x] if (row[x + 1] >= before) & (row[x + 1] > after) else np.uint8(0)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def strongest_first(strength, crest, found, order):
     """Fill order (P,) with y << 16 | x of the pixels where crest (H, W) is not 0, by falling strength; returns P.
 
@@ -87,7 +88,7 @@ def strongest_first(strength, crest, found, order):
     return p
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def grow(x, y, angle, region):
     """Fill region (N,) with the places connected to (x, y) whose gradients agree with their mean; angle <- 0 there.
 
@@ -115,7 +116,7 @@ def grow(x, y, angle, region):
     return n, (np.float32(seed) + mean) / TURN
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def straight(region, strength, direction, ends):
     """Fill ends (2, 2) px of the axis of region (N,), the brighter side (direction, rad) along its normal."""
     w = u = v = uu = uv = vv = 0.0
@@ -141,7 +142,7 @@ def straight(region, strength, direction, ends):
     ends[1, 0], ends[1, 1] = u + 0.5 + last * tu, v + 0.5 + last * tv
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def segments(image, shortest, work):
     """Ends (M, 2, 2) px of the straight edges of image (H, W) with at least so many px, brighter along (-t_v, t_u).
 

@@ -2,10 +2,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from line_slam_ros.kernel_cache import kernel
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def beside(u, v, tu, tv, other, tolerance):
     """(first, last) px of other (2, 2) along the line from (u, v) in direction (tu, tv); (0, -1) if it is off by more
     than tolerance px."""
@@ -16,7 +17,7 @@ def beside(u, v, tu, tv, other, tolerance):
     return a * tu + b * tv, c * tu + d * tv
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def duplicates(ends, tolerance, of, doubled):
     """Mark in doubled (M,) every segment (2, 2) that lies, for a third of the shorter, on an earlier unmarked one.
 
@@ -34,7 +35,7 @@ def duplicates(ends, tolerance, of, doubled):
                 doubled[j] = True
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def join(ends, tolerance, gap, joined):
     """Lengthen segments by later collinear ones across at most gap px; mark these in joined (M,)."""
     for i in range(len(ends)):

@@ -2,10 +2,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from line_slam_ros.kernel_cache import kernel
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def smooth(image, row, out):
     """Fill out (H, W) with image (H, W), 2 x 2 and more, under the weights 1 2 1; beyond its rim it is mirrored.
 
@@ -21,7 +22,7 @@ def smooth(image, row, out):
             to[x] = np.uint8(np.uint16(row[x] + row[x + 2] + two * row[x + 1] + half) >> shift)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def halve(image, row, out):
     """Fill out ((H + 1) / 2, (W + 1) / 2) with every second pixel of image (H, W), 3 x 3 and more, under the weights
     1 4 6 4 1; beyond its rim it is mirrored. row (W + 4,) uint16: work space."""

@@ -7,10 +7,10 @@ never exceeds |x2 - X1|: at a standstill or in a pure rotation every good match 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from line_slam_ros.geometry.lie_kernels import retract_rotation
+from line_slam_ros.kernel_cache import inner, kernel
 from line_slam_ros.types import F64
 
 FEWEST = 8  # matches; fewer than this cannot contradict each other
@@ -39,21 +39,21 @@ def static_matches(x1: F64, x2: F64, R_21: F64 | None, rotation_sigma: float,
     return keep, R
 
 
-@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+@inner(forceinline=True)
 def _turn(R, x):
     """Ray R (x, 1) as three numbers."""
     return (R[0, 0] * x[0] + R[0, 1] * x[1] + R[0, 2], R[1, 0] * x[0] + R[1, 1] * x[1] + R[1, 2],
             R[2, 0] * x[0] + R[2, 1] * x[1] + R[2, 2])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def _fit_rotation(x1, x2, threshold, R):
     """Improve R (3, 3), in place, until R x1 best explains x2 (N, 2): Cauchy weights whose scale falls to threshold."""
     J, A, b, e = np.empty((2, 3)), np.empty((3, 3)), np.empty(3), np.empty(2)
     for step in range(8):
         scale = max(threshold, 0.2 * 0.5**step)
-        A[:] = 1e-9 * np.eye(3)
-        b[:] = 0.0
+        A[:], b[:] = 0.0, 0.0
+        A[0, 0] = A[1, 1] = A[2, 2] = 1e-9
         for i in range(len(x1)):
             X0, X1, X2 = _turn(R, x1[i])
             e[0], e[1] = x2[i, 0] - X0 / X2, x2[i, 1] - X1 / X2
@@ -69,7 +69,7 @@ def _fit_rotation(x1, x2, threshold, R):
         retract_rotation(R, np.linalg.solve(A, b), R)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _epipolar_distance(X, x2, t):
     """Signed distance of x2 (2,) to the line t x X of a turned ray X (3 numbers); 0 where that line is undefined."""
     n0, n1, n2 = t[1] * X[2] - t[2] * X[1], t[2] * X[0] - t[0] * X[2], t[0] * X[1] - t[1] * X[0]
@@ -79,7 +79,7 @@ def _epipolar_distance(X, x2, t):
     return (n0 * x2[0] + n1 * x2[1] + n2) / rho
 
 
-@njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+@inner(fastmath=True)
 def _cost(X, x2, t, limit, best):
     """Sum of squared distances, limit at most, of x2 (2, N) to the lines t x X of turned rays X (3, N); as soon as it
     exceeds best, any number that does."""
@@ -94,7 +94,7 @@ def _cost(X, x2, t, limit, best):
     return total
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def _consensus(x1, x2, threshold, rotation_sigma, R, keep):
     """Fill keep (N,) and improve R: the best two-point hypothesis, refined together with the rotation, then gated."""
     n = len(x1)
@@ -122,13 +122,14 @@ def _consensus(x1, x2, threshold, rotation_sigma, R, keep):
         cost = _cost(X, seen, guess, 4.0 * threshold * threshold, best)
         if cost < best:
             best = cost
-            t[:] = guess
+            for p in range(3):
+                t[p] = guess[p]
     _refine(x1, x2, threshold, rotation_sigma, R, t)
     for k in range(n):
         keep[k] = abs(_epipolar_distance(_turn(R, x1[k]), x2[k], t)) < threshold
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _refine(x1, x2, threshold, rotation_sigma, R, t):
     """Gauss-Newton on R <- R Exp(d) (prior: no change, rotation_sigma) and on the direction t (3,), in place.
 

@@ -9,9 +9,9 @@ to first order in the angle between axis and line; every variance below is of su
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from line_slam_ros.config import Mapping
+from line_slam_ros.kernel_cache import inner, kernel
 from line_slam_ros.types import F64
 
 AGREEMENT = 2.5  # standard deviations within which two lines may be one
@@ -34,7 +34,7 @@ def worst_sigma(pluecker: F64, cov: F64, ends: F64) -> F64:
     return sigma
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def offsets(pluecker, cov, points, axes, mean, across):
     """Offsets of the line from points (K, 3) along axes (A, 3): mean (K A,) and covariance across (K A, K A), m."""
     size = len(points) * len(axes)
@@ -61,13 +61,13 @@ def offsets(pluecker, cov, points, axes, mean, across):
             across[j, i] = across[i, j]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def _worst_sigmas(pluecker, cov, ends, sigma):
     for i in range(len(pluecker)):
         sigma[i] = _worst_sigma(pluecker[i], cov[i], ends[i])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _worst_sigma(pluecker, cov, ends):
     axes, mean, across = np.empty((2, 3)), np.empty(2), np.empty((2, 2))
     _axes_across(pluecker[3:], axes)
@@ -79,7 +79,7 @@ def _worst_sigma(pluecker, cov, ends):
     return np.sqrt(worst)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def twin(pluecker, cov, ends, others, other_cov, other_ends, rows, gone, nearness):
     """Row of the nearest of the other lines (L, 6), (L, 6, 6), (L, 2, 3) that is the same line as this one, -1 if none
     is, and how far away it is, m. Only rows (K,) that are not gone (L,) are looked at, nearness as
@@ -97,7 +97,7 @@ def twin(pluecker, cov, ends, others, other_cov, other_ends, rows, gone, nearnes
     return best, nearest
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def within(low, high, ends, rows):
     """How many of the segments (L, 2, 3) have boxes that touch the one from low to high (3,); fills rows with them."""
     count = 0
@@ -111,7 +111,7 @@ def within(low, high, ends, rows):
     return count
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _distance(d, ends, other, other_ends, nearness):
     """Largest distance between two lines where both extents overlap, or infinity when the extents are more than a gap
     apart or the distance is too large."""
@@ -132,7 +132,7 @@ def _distance(d, ends, other, other_ends, nearness):
     return np.sqrt(worst) if worst <= nearness[1] * nearness[1] else np.inf
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _agree(a, a_cov, a_ends, b, b_cov, b_ends, merge_distance):
     """Whether two near lines are one within their uncertainty.
 
@@ -159,7 +159,7 @@ def _agree(a, a_cov, a_ends, b, b_cov, b_ends, merge_distance):
     return True
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _share_beside(d, short, long):
     """Share of the short segment's length that lies beside the long one's extent along d."""
     begin, end, first, last = _along(short[0], d), _along(short[1], d), _along(long[0], d), _along(long[1], d)
@@ -167,7 +167,7 @@ def _share_beside(d, short, long):
     return (min(end, last) - max(begin, first)) / max(end - begin, ROUNDING)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def fuse(a, a_cov, a_ends, b, b_cov, b_ends, pluecker, cov, ends):
     """The information-weighted mean of two estimates of one line, over the union of their extents.
 
@@ -205,7 +205,7 @@ def fuse(a, a_cov, a_ends, b, b_cov, b_ends, pluecker, cov, ends):
     return _worst_sigma(pluecker, cov, ends)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _extent(d, a_ends, b_ends, points):
     """points (2, 3): where the union of two segments begins and ends along d, on the axis through the first's end."""
     origin = _along(a_ends[0], d)
@@ -216,7 +216,7 @@ def _extent(d, a_ends, b_ends, points):
         points[1, c] = points[0, c] + max(high - low, ROUNDING) * d[c]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _line_through(points, axes, across, pluecker, cov):
     """The line through points (2, 3) whose offsets along axes (2, 3) have covariance across (4, 4), and its own."""
     p, d = points[0], pluecker[3:]
@@ -244,7 +244,7 @@ def _line_through(points, axes, across, pluecker, cov):
             cov[r, c] = cov[c, r] = total
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _solve(A, B, X):
     """X = A^-1 B for a positive definite A (N, N), which is overwritten by its Cholesky factor."""
     size = len(A)
@@ -265,7 +265,7 @@ def _solve(A, B, X):
             X[i, c] /= A[i, i]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _axes_across(d, axes):
     """axes (2, 3): unit vectors at right angles to the unit vector d and to each other."""
     least = 0 if abs(d[0]) <= min(abs(d[1]), abs(d[2])) else 1 if abs(d[1]) <= abs(d[2]) else 2
@@ -275,7 +275,7 @@ def _axes_across(d, axes):
     _cross(d, axes[0], axes[1])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _foot(pluecker, p, foot):
     """The point of the line [n, d], |d| = 1, that is nearest to p: d x n + (d . p) d."""
     d = pluecker[3:]
@@ -285,16 +285,16 @@ def _foot(pluecker, p, foot):
         foot[c] += share * d[c]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _length(ends):
     return np.sqrt((ends[1, 0] - ends[0, 0]) ** 2 + (ends[1, 1] - ends[0, 1]) ** 2 + (ends[1, 2] - ends[0, 2]) ** 2)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _along(p, d):
     return p[0] * d[0] + p[1] * d[1] + p[2] * d[2]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _cross(a, b, out):
     out[0], out[1], out[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

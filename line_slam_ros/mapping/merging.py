@@ -4,9 +4,9 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numba import njit
 
 from line_slam_ros.config import Mapping
+from line_slam_ros.kernel_cache import inner, kernel
 from line_slam_ros.mapping.fusion import fuse, nearness, twin, within
 from line_slam_ros.mapping.table import IdTable
 from line_slam_ros.types import F64, I64, LineSegments
@@ -63,7 +63,7 @@ class Merging:
         return LineSegments(ids[order], *(column.take(order, axis=0) for column in columns))  # 4 x as fast as [order]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def _merge(landmarks, namesakes, kept, near, gone, changed, stays):
     """Each landmark is fused with every twin among the kept lines and the landmarks before it; the lowest id survives.
     Of two under one id that are not the same line, the more certain one stays.
@@ -84,7 +84,7 @@ def _merge(landmarks, namesakes, kept, near, gone, changed, stays):
     reach = near[2] + near[1] / near[0]
     count = within(low - reach, high + reach, kept_ends, rows)
     for i in range(len(ids)):
-        line[:], line_cov[:], line_ends[:] = pluecker[i], cov[i], ends[i]
+        _copy(pluecker[i], cov[i], ends[i], line, line_cov, line_ends)
         line_id, line_views, line_sigma = ids[i], views[i], sigma[i]
         while True:
             k, distance = twin(line, line_cov, line_ends, kept_pluecker, kept_cov, kept_ends, rows[:count], gone, near)
@@ -106,12 +106,25 @@ def _merge(landmarks, namesakes, kept, near, gone, changed, stays):
                 count = within(low - reach, high + reach, kept_ends, rows)
         namesake = namesakes[i] if line_id == ids[i] else -1
         if _prevails(i, line_id, line_sigma, namesake, kept_sigma, gone, to_ids, to_sigma, away):
-            to_pluecker[i], to_cov[i], to_ends[i] = line, line_cov, line_ends
+            _copy(line, line_cov, line_ends, to_pluecker[i], to_cov[i], to_ends[i])
             to_ids[i], to_views[i], to_sigma[i], away[i] = line_id, line_views, line_sigma, False
-    stays[:] = ~away
+    for i in range(len(ids)):
+        stays[i] = not away[i]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
+def _copy(line, cov, ends, to_line, to_cov, to_ends):
+    """Line (6,), cov (6, 6) and ends (2, 3), by elements: assigning whole arrays compiles seconds of error messages."""
+    for k in range(6):
+        to_line[k] = line[k]
+        for m in range(6):
+            to_cov[k, m] = cov[k, m]
+    for k in range(2):
+        for m in range(3):
+            to_ends[k, m] = ends[k, m]
+
+
+@inner
 def _prevails(i, line_id, line_sigma, namesake, kept_sigma, gone, to_ids, to_sigma, away):
     """Whether landmark i is more certain than the others of its id, which then go: the kept row namesake (-1: none) and
     landmarks before it."""
@@ -127,7 +140,7 @@ def _prevails(i, line_id, line_sigma, namesake, kept_sigma, gone, to_ids, to_sig
     return prevails
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _widen(points, low, high):
     """Takes points (N, 3) into the box, with some room around them; whether it grew."""
     grew = False

@@ -16,14 +16,15 @@ median of nearly all, with clipped ones that of those that reach the end; one ba
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from line_slam_ros.kernel_cache import inner, kernel
 
 NEAREST = 0.05  # m, feet closer to the image plane are not used
 STEEPEST = 0.09  # sine of 5 degrees, smallest angle between a ray and the line for a usable foot
 SPREAD = 3.5  # half width of a cluster of views, standard deviations
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def trim(rows, pluecker, poses, ends, count, furthest, share, noise, trimmed, parallax):
     """End points of the lines in rows (R,) from their views.
 
@@ -64,7 +65,7 @@ def trim(rows, pluecker, poses, ends, count, furthest, share, noise, trimmed, pa
         parallax[r] = _parallax(n, d, poses[i, : count[i]])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _line_in_camera(n, d, pose):
     """(n0, n1, n2, d0, d1, d2) in C and p_WC . d."""
     m0 = n[0] - (pose[1, 3] * d[2] - pose[2, 3] * d[1])
@@ -79,7 +80,7 @@ def _line_in_camera(n, d, pose):
             pose[0, 3] * d[0] + pose[1, 3] * d[1] + pose[2, 3] * d[2])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _runs_backwards(n, d, pose, ends):
     """Whether the observed segment points against the image of d, whatever the order of its ends."""
     _, _, _, d0, d1, d2, _ = _line_in_camera(n, d, pose)
@@ -87,7 +88,7 @@ def _runs_backwards(n, d, pose, ends):
     return (ends[1, 0] - ends[0, 0]) * (d0 - u * d2) + (ends[1, 1] - ends[0, 1]) * (d1 - v * d2) < 0.0
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def _foot(n, d, pose, end, furthest, out):
     """out = [position along the line (m), its change per rad of the ray (m), distance across in the image].
 
@@ -104,7 +105,7 @@ def _foot(n, d, pose, end, furthest, out):
     return z > NEAREST and reach < furthest and distance > STEEPEST * reach
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _sort(values, order):
     """order[:N] = rows of values (N,) from smallest to largest, by insertion."""
     for k in range(len(values)):
@@ -115,7 +116,7 @@ def _sort(values, order):
         order[j] = k
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _outermost(positions, scales, sigma, share, order):
     """The vote of the module's docstring: positions (N,) grow outwards, sigma * scales are their half widths."""
     count = len(positions)
@@ -142,7 +143,7 @@ def _outermost(positions, scales, sigma, share, order):
     return previous
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _parallax(n, d, poses):
     """Range of the angles (rad) about the line at which the cameras (K, 3, 4) stand; 0 without cameras."""
     lowest, highest = 0.0, 0.0

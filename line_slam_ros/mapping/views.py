@@ -6,9 +6,9 @@ again, exactly, whenever the landmark's estimate changes.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import DTypeLike
 
+from line_slam_ros.kernel_cache import inner, kernel
 from line_slam_ros.mapping.table import IdTable
 from line_slam_ros.types import F64, I64
 
@@ -35,7 +35,7 @@ def add_view(table: IdTable, rows: I64, T_WC: F64, ends: F64, sigma: F64) -> Non
               table['count'], table['seen'])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def _add_view(rows, pose, ends, sigma, all_poses, all_ends, all_sigma, count, seen):
     capacity = all_poses.shape[1]
     for m in range(len(rows)):
@@ -55,7 +55,7 @@ def _add_view(rows, pose, ends, sigma, all_poses, all_ends, all_sigma, count, se
         seen[i] += 1
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _write(pose, ends, sigma, to_pose, to_ends, to_sigma):
     for r in range(3):
         for c in range(4):
