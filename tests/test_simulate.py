@@ -161,7 +161,7 @@ def test_wrong_usage_is_explained(arguments, capsys):
 
 def test_help_names_all_options(capsys):
     with pytest.raises(SystemExit) as done:
-        command_line.main(['simulate', '--help'])
+        command_line.main(['simulate', 'house', '--help'])
     assert done.value.code == 0
     text = capsys.readouterr().out
     for option in ('seed', 'lines', 'frames', 'trajectory', 'width', 'height', 'focal', 'camera', 'noise-px',

@@ -1,4 +1,4 @@
-"""``line_slam simulate``: known camera poses, true lines and what the camera saw of them, as text files."""
+"""``line_slam simulate``: recordings of worlds that are known exactly."""
 from __future__ import annotations
 
 import argparse
@@ -10,19 +10,33 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from line_slam_ros.simulation.house import Pinhole
 
-WORLDS = ('house',)
 SETTINGS = 'simulation.json'
 
 
 def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
-        'simulate', help='make a world of lines and the views of a camera in it',
+        'simulate', help='make a recording of a world that is known exactly',
+        description='Makes a random world and a recording in it. The same settings give the same bytes.')
+    worlds = parser.add_subparsers(dest='world', required=True, metavar='WORLD')
+    _add_house(worlds)
+    _add_corridor(worlds)
+
+
+def run(args: argparse.Namespace) -> int:
+    """0; ValueError or OSError when a setting or a file cannot be used."""
+    if args.world == 'house':
+        return _house(args)
+    from line_slam_ros.cli.simulating import record_corridor
+    return record_corridor(args.directory, args.seed, args.speed, args.sway, args.seconds, args.light, args.texture)
+
+
+def _add_house(worlds: Any) -> None:
+    parser = worlds.add_parser(
+        'house', help='camera poses, true lines and observed segments, as text files',
         description='Makes a random house of vertical, horizontal and slanted lines and the views of a camera that '
                     'goes round in it. Writes cam_pose_tum.txt, house.txt and observations.txt, which optimize-lines '
                     f'reads, and {SETTINGS} with every setting. The same settings give the same bytes.')
-    parser.add_argument('world', choices=WORLDS, help='kind of world')
-    parser.add_argument('directory', type=Path, metavar='DIR', help='where the files go; made if missing')
-    parser.add_argument('--seed', type=int, default=0, help='of world, motion, noise and all else (default 0)')
+    _add_common(parser)
     parser.add_argument('--lines', type=int, default=80, help='of the house, at least 22 (default 80)')
     motion = parser.add_mutually_exclusive_group()
     motion.add_argument('--frames', type=int, default=600, help='of one loop in the house (default 600)')
@@ -32,8 +46,28 @@ def add_parser(subparsers: Any) -> None:
     _add_effects(parser.add_argument_group('effects', 'shares are of all views, from 0 to 1'))
 
 
-def run(args: argparse.Namespace) -> int:
-    """0; ValueError when a setting or a file cannot be used."""
+def _add_corridor(worlds: Any) -> None:
+    parser = worlds.add_parser(
+        'corridor', help='a bag with images and IMU of a walk along a corridor with little texture',
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        description='Renders a walk along a corridor of plain walls with one or two turns, 30 to 60 m long: with '
+                    'lens distortion, motion blur, noise and automatic exposure. Writes bag, calibration.yaml (Kalibr '
+                    'form), groundtruth.tum and gt_lines.csv. The same settings give the same bytes.')
+    _add_common(parser)
+    parser.add_argument('--speed', type=float, default=1.2, metavar='M_PER_S', help='of the walk where it is straight')
+    parser.add_argument('--sway', type=float, default=1.0, help='strength of the shaking on top, from 0 to 5')
+    parser.add_argument('--seconds', type=float, help='cut the recording to; without, it ends with the corridor')
+    parser.add_argument('--light', type=float, default=1.0,
+                        help='brightness of the world; below 0.3 the images get noisy and blurred by motion')
+    parser.add_argument('--texture', type=float, default=1.0, help='strength of the weak pattern of the surfaces')
+
+
+def _add_common(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('directory', type=Path, metavar='DIR', help='where the files go; made if missing')
+    parser.add_argument('--seed', type=int, default=0, help='of world, motion, noise and all else')
+
+
+def _house(args: argparse.Namespace) -> int:
     from line_slam_ros.experiment import files
     from line_slam_ros.simulation import house
     camera = _camera(args)

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from line_slam_ros.geometry.lie import right_jacobian, so3_exp
 from line_slam_ros.types import F64, Calibration, ImuBatch, ImuNoise, LineObservations, Observations, PointObservations
@@ -18,6 +20,13 @@ ROOM = np.array([6.0, 5.0, 2.5])  # m, walls at +- half in x and y, floor at 0
 CORRIDOR = np.array([60.0, 2.2, 2.5])  # m, along x from the start
 CAMERA_IN_BODY = np.array([[0.0, 0.0, 1.0, 0.02], [-1.0, 0.0, 0.0, -0.05], [0.0, -1.0, 0.0, 0.01],
                            [0.0, 0.0, 0.0, 1.0]])
+
+
+class Motion(Protocol):
+    """Where the body is and what an IMU there would measure without error."""
+
+    def at(self, t: F64) -> tuple[F64, F64, F64, F64, F64]:
+        """At times t (N,) s: R_WB (N, 3, 3), p_W, v_W, angular velocity in B, specific force in B, each (N, 3)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +116,18 @@ def calibration(noise: ImuNoise | None = None) -> Calibration:
                        0.0, noise or ImuNoise())
 
 
+def imu_readings(motion: Motion, noise: ImuNoise, count: int, rate: float, rng: np.random.Generator,
+                 gyro_bias: ArrayLike, accel_bias: ArrayLike) -> ImuBatch:
+    """The first ``count`` readings of an IMU at ``rate`` Hz: exact ones, with biases that walk and white noise."""
+    t, root = np.arange(count) / rate, np.sqrt(rate)
+    _, _, _, omega, force = motion.at(t)
+    walk = rng.normal(size=(2, count, 3)).cumsum(axis=1) / root
+    white = root * rng.normal(size=(2, count, 3))
+    gyro = omega + gyro_bias + noise.gyro_walk * walk[0] + noise.gyro_density * white[0]
+    accel = force + accel_bias + noise.accel_walk * walk[1] + noise.accel_density * white[1]
+    return ImuBatch(np.round(t * 1e9).astype(np.int64), gyro, accel)
+
+
 @dataclass(frozen=True, slots=True)
 class Sequence:
     """A simulated recording: iterate for (Observations, ImuBatch)."""
@@ -135,14 +156,9 @@ class Sequence:
             previous = t_ns
 
     def _imu(self, rng: np.random.Generator) -> ImuBatch:
-        n, noise = int(self.seconds * self.imu_rate) + 2, self.calibration.imu_noise
-        t, root = np.arange(n) / self.imu_rate, np.sqrt(self.imu_rate)
-        _, _, _, omega, force = self.trajectory.at(t)
-        walk = rng.normal(size=(2, n, 3)).cumsum(axis=1) / root
-        white = root * rng.normal(size=(2, n, 3))
-        gyro = omega + self.gyro_bias + noise.gyro_walk * walk[0] + noise.gyro_density * white[0]
-        accel = force + self.accel_bias + noise.accel_walk * walk[1] + noise.accel_density * white[1]
-        return ImuBatch(np.round(t * 1e9).astype(np.int64), gyro, accel)
+        count = int(self.seconds * self.imu_rate) + 2
+        return imu_readings(self.trajectory, self.calibration.imu_noise, count, self.imu_rate, rng, self.gyro_bias,
+                            self.accel_bias)
 
     def observe(self, t_ns: int, rng: np.random.Generator) -> Observations:
         """What is in view at t_ns, with pixel noise."""
