@@ -82,7 +82,8 @@ class Estimator(Checked):
     init_window_s: float = param(2.0, 'longest stretch of images that a start from motion uses, s', 0.5, 10.0)
     init_max_scale_sigma: float = param(0.05, 'relative uncertainty of scale at which a start is accepted', 0.001, 1.0)
     keyframe_max_s: float = param(1.0, 'longest time between keyframes while moving, s', 0.1, 10.0)
-    max_blind_s: float = param(2.0, 'longest time without features before the estimate counts as lost, s', 0.1, 60.0)
+    max_blind_m: float = param(1.0, 'time without features times standard deviation of the velocity at which the '
+                               'estimate counts as lost, m', 0.01, 1000.0)
     keyframe_parallax_px: float = param(20.0, 'mean parallax to the last keyframe that makes a new one, px', 0.5, 200.0)
 
 

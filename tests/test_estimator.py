@@ -126,9 +126,11 @@ def test_blindness_longer_than_allowed_is_a_failure_that_says_so(moving):
     def blind(k, seen):
         return replace(seen, points=NO_POINTS, lines=NO_LINES) if k >= 120 else seen
 
-    *_, failures = run(moving, Options(max_blind_s=1.0), blind)
+    _, t, p, _, failures = run(moving, Options(max_blind_m=0.1), blind)
     assert not any(failures[:70])
     assert 'nothing followed' in failures[-1]
+    _, t, p, _, failures = run(moving, Options(max_blind_m=1000.0), blind)
+    assert not any(failures) and aligned_error(moving, t, p) < 0.5
 
 
 def test_covariance_grows_with_distance_and_bounds_the_error(moving):

@@ -12,7 +12,7 @@ from line_slam_ros.estimation.stillness import SPAN_S
 from line_slam_ros.geometry.lie import so3_exp
 from line_slam_ros.types import F64, Calibration, Observations, Samples
 
-MIN_MATCHES = 20
+MIN_MATCHES = 10  # corners; their motion between two images has five unknowns
 MIN_PARALLAX_PX = 15.0  # median shift, rotation included, between first and last frame
 MIN_VIEWS = 4  # of a corner that says something about the quality of a start
 MAX_CHI2 = 4.0  # median squared whitened residual of a refined start; 1.4 when the noise model is right

@@ -12,7 +12,7 @@ from line_slam_ros.estimation.marginalisation import drop_state, marginalise_old
 from line_slam_ros.estimation.shift import FEW_CORNERS, corner_shifts, segment_shifts
 from line_slam_ros.estimation.solver import CONVERGED, LEAST_DAMPING, Solver, SolverOptions
 from line_slam_ros.estimation.triangulation import lines_in_cameras, start_lines, start_points
-from line_slam_ros.estimation.window import RIG, Window, state_row
+from line_slam_ros.estimation.window import RIG, LandmarkTable, Window, state_row
 from line_slam_ros.geometry.lie import rigid
 from line_slam_ros.geometry.line_forms import unit_world_lines
 from line_slam_ros.types import F64, I64, Calibration, LineForm, Observations, RigCorrection, Samples
@@ -269,7 +269,7 @@ class Estimator:
             table.keep(seen[:, n - 1] | (seen.sum(axis=1) >= 2))
 
     def _is_keyframe(self) -> bool:
-        """By mean parallax (rotation removed) against the previous keyframe, share of shared tracks, and time."""
+        """By mean parallax (rotation removed) against the previous keyframe, share of its tracks left, and time."""
         w, n = self.window, self.window.n
         if n < 2:
             return True
@@ -279,16 +279,16 @@ class Estimator:
         if (w.t_ns[b] - w.t_ns[a]) * 1e-9 > self.options.keyframe_max_s:
             return True
         p, q = w.points, w.lines
-        both, now = p.seen[:p.count, a] & p.seen[:p.count, b], p.seen[:p.count, b].sum()
+        both, had = p.seen[:p.count, a] & p.seen[:p.count, b], _followed(p, a, n)
         R = w.R_BC.T @ w.R[a].T @ w.R[b] @ w.R_BC
         shifts = corner_shifts(p.z[:p.count, a][both], _turned(R, p.z[:p.count, b][both]))
         if len(shifts) < FEW_CORNERS:
-            both, now = q.seen[:q.count, a] & q.seen[:q.count, b], now + q.seen[:q.count, b].sum()
+            both, had = q.seen[:q.count, a] & q.seen[:q.count, b], had + _followed(q, a, n)
             then, sigma = q.z[:q.count, a][both], q.sigma[:q.count, a][both]
             size, _ = segment_shifts(then, _turned(R, q.z[:q.count, b][both]), sigma, sigma)
             shifts = np.concatenate([shifts, size])
-        if len(shifts) < max(0.5 * now, 1):
-            return bool(now > 0)
+        if len(shifts) < max(0.5 * had, 1):
+            return bool(p.seen[:p.count, b].any() or q.seen[:q.count, b].any())
         return float(np.mean(shifts)) * self.focal > self.options.keyframe_parallax_px
 
     def _health(self) -> str:
@@ -303,7 +303,14 @@ class Estimator:
         if sum(int(f.sum()) for f in followed) >= MIN_FEATURES:
             self._last_sight_ns = w.t_ns[k]
         blind = (w.t_ns[k] - self._last_sight_ns) * 1e-9
-        return f'nothing followed from image to image for {blind:.1f} s' if blind > self.options.max_blind_s else ''
+        astray = blind * float(np.sqrt(np.trace(self.covariance()[6:, 6:]))) if blind > 0.0 else 0.0
+        return f'nothing followed from image to image for {blind:.1f} s' if astray > self.options.max_blind_m else ''
+
+
+def _followed(table: LandmarkTable, slot: int, n: int) -> int:
+    """How many of a state's tracks another state saw, too: in a noisy image most new ones do not outlive it."""
+    seen = table.seen[:table.count, :n]
+    return int((seen[:, slot] & (seen.sum(axis=1) >= 2)).sum())
 
 
 def _turned(R_ab: F64, x: F64) -> F64:
