@@ -15,7 +15,7 @@ from line_slam_ros.config import Estimator as EstimatorOptions
 from line_slam_ros.estimation.bootstrap import Bootstrap
 from line_slam_ros.estimation.estimator import Estimator
 from line_slam_ros.frontend.front_end import FrontEnd
-from line_slam_ros.geometry.camera import warm_up_lenses
+from line_slam_ros.geometry.camera import Camera, warm_up_lenses
 from line_slam_ros.geometry.imu import between, turned
 from line_slam_ros.geometry.lie import quaternion_from_matrix
 from line_slam_ros.geometry.lie_kernels import retract_rotation
@@ -24,32 +24,53 @@ from line_slam_ros.mapping.line_map import LineMap
 from line_slam_ros.simulation.features import Room, Sequence, Trajectory, calibration
 from line_slam_ros.types import Calibration, Frame
 
-BESIDE = """import sys
+RUN = """import sys
 sys.path[:] = {path!r}
 from line_slam_ros import warm_up
-warm_up.LineMap.warm_up(warm_up.Config().mapping)
-warm_up.warm_up_estimator(warm_up.EstimatorOptions())"""
+warm_up.{work}()"""
 
 
 def warm_up(front_end: FrontEnd, calibration: Calibration, config: Config, tell: Callable[[str], None]) -> None:
-    """Everything. With nothing in the cache this is told, and another process compiles map and estimator meanwhile."""
-    beside, empty = None, cache_is_empty(tell)
-    quaternion_from_matrix(np.eye(3))
-    turned(np.array([0.0, 0.1]), np.zeros((2, 3)), np.zeros(3))
-    retract_rotation(np.eye(3), np.zeros(3), np.eye(3))  # what both need, once: numba's cache is made for one writer
-    if empty and len(os.sched_getaffinity(0)) > 1:
-        beside = subprocess.Popen([sys.executable, '-c', BESIDE.format(path=sys.path)])
-        atexit.register(beside.kill)
+    """Everything. With nothing in the cache this is told, and other processes compile first: kernels that were compiled
+    where they run may differ by a rounding from those loaded, and the first run shall give the bytes of all others."""
+    if cache_is_empty(tell):
+        elsewhere(compile_all).wait()  # what it could not compile is compiled here, and its error comes up again
+    warm_up_shared()
+    LineMap.warm_up(config.mapping)
     warm_up_lenses()
     warm_up_front_end(front_end, calibration)
-    if beside is not None:
-        beside.wait()  # what it could not compile is compiled here, and its error comes up again
-    LineMap.warm_up(config.mapping)
     warm_up_estimator(config.estimator)
     fill()
 
 
-def warm_up_estimator(options: EstimatorOptions) -> None:
+def compile_all() -> None:
+    """Every kernel, the estimator's beside by one more process where there is a core for it."""
+    warm_up_shared()  # first, and once: numba's cache is made for one writer
+    estimator = elsewhere(warm_up_estimator) if len(os.sched_getaffinity(0)) > 1 else None
+    warm_up_lenses()
+    warm_up_front_end(FrontEnd(Camera(calibration()), Config()), calibration())
+    LineMap.warm_up(Config().mapping)
+    if estimator is None:
+        warm_up_estimator()
+    else:
+        estimator.wait()
+
+
+def elsewhere(work: Callable[[], None]) -> subprocess.Popen:
+    """A function of this module at work in a process of its own, which ends with this one."""
+    process = subprocess.Popen([sys.executable, '-c', RUN.format(path=sys.path, work=work.__name__)])
+    atexit.register(process.kill)
+    return process
+
+
+def warm_up_shared() -> None:
+    """What front end and estimator both need."""
+    quaternion_from_matrix(np.eye(3))
+    turned(np.array([0.0, 0.1]), np.zeros((2, 3)), np.zeros(3))
+    retract_rotation(np.eye(3), np.zeros(3), np.eye(3))
+
+
+def warm_up_estimator(options: EstimatorOptions = EstimatorOptions()) -> None:  # noqa: B008, it is frozen
     """A few simulated seconds: start from motion, optimise, marginalise."""
     sequence = Sequence(Trajectory.random(1), Room.random(1, points=300, lines=60), calibration(), 4.0, frame_rate=10.0)
     estimator = Estimator(options, sequence.calibration, 450.0, 300, 60)

@@ -1,4 +1,4 @@
-"""Starting without compiled kernels: it is told, and half of the work is done beside."""
+"""Starting without compiled kernels: it is told, and other processes compile."""
 import os
 import subprocess
 import sys
@@ -8,7 +8,7 @@ from numba import njit
 from numba.core.event import install_recorder
 
 from line_slam_ros.kernel_cache import COMPILING, inner
-from line_slam_ros.warm_up import BESIDE
+from line_slam_ros.warm_up import RUN, compile_all, warm_up_estimator
 
 ASK = 'from line_slam_ros.kernel_cache import *; print(cache_is_empty(print)); fill()'
 
@@ -78,6 +78,7 @@ def test_an_inner_kernel_is_compiled_once_whatever_constants_it_gets(decorate, v
     assert starts.count(scaled) == versions
 
 
-def test_the_process_beside_does_its_work_wherever_this_one_found_the_package():
-    done = run(BESIDE.format(path=sys.path), PYTHONPATH='')
+@pytest.mark.parametrize('work', [compile_all, warm_up_estimator])
+def test_another_process_does_its_work_wherever_this_one_found_the_package(work):
+    done = run(RUN.format(path=sys.path, work=work.__name__), PYTHONPATH='')
     assert done.returncode == 0, done.stderr

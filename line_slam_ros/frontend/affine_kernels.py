@@ -24,6 +24,7 @@ from line_slam_ros.frontend.patch_kernels import (
     dot,
     gradient,
 )
+from line_slam_ros.geometry.small_systems import solve_positive
 from line_slam_ros.kernel_cache import inner, kernel
 
 STIFFNESS = 50.0  # a weak belief that the shape does not change
@@ -64,7 +65,10 @@ def learn(image, uv, slots, templates, moments, inverses, ok):
 
     Fills rows slots (N,) of templates, moments and inverses, see the module.
     """
-    J, H, patch = np.empty((7, AREA), np.float32), np.empty((6, 6)), np.zeros((SIZE + 2, LANES + 2), np.float32)
+    J, patch = np.empty((7, AREA), np.float32), np.zeros((SIZE + 2, LANES + 2), np.float32)
+    H, identity = np.empty((6, 6)), np.zeros((6, 6))
+    for p in range(6):
+        identity[p, p] = 1.0
     for i in range(len(uv)):
         if not ok[i]:
             continue
@@ -74,16 +78,17 @@ def learn(image, uv, slots, templates, moments, inverses, ok):
         slot = slots[i]
         gradient(patch, templates[slot])
         steepest(patch, J, moments[slot])
-        templates[slot, 0] = J[0]
-        templates[slot, 1] *= INSIDE
-        templates[slot, 2] *= INSIDE
+        for k in range(AREA):  # by elements: assigning whole arrays compiles seconds of error messages
+            templates[slot, 0, k] = J[0, k]
+            templates[slot, 1, k] *= INSIDE[k]
+            templates[slot, 2, k] *= INSIDE[k]
         for p in range(6):
             for q in range(p + 1):
                 H[p, q] = H[q, p] = dot(J[1 + p], J[1 + q])
             H[p, p] += STIFFNESS if p > 1 else 1e-3
         ok[i] = H[0, 0] * H[1, 1] - H[0, 1] ** 2 >= 1e-3 * SIZE**4
         if ok[i]:
-            inverses[slot] = np.linalg.inv(H)
+            solve_positive(H, identity, inverses[slot])
 
 
 @kernel

@@ -4,8 +4,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from line_slam_ros.kernel_cache import kernel
-from line_slam_ros.types import F64, U8
+from line_slam_ros.kernel_cache import inner, kernel
+from line_slam_ros.types import F32, F64, U8
 
 WINDOW = 2  # px, half side of the window of the structure tensor, on the half-size image
 MARGIN = 8  # px of the half-size image without corners
@@ -59,18 +59,27 @@ def corner_score(image, floor, score):
             score[centre, x] = smaller if smaller > floor else np.float32(0.0)
 
 
-@kernel
-def spread(score, tracked, count, min_distance, cell):
+def spread(score: F32, tracked: F64, count: int, min_distance: float, cell: float) -> F64:
     """Corners (N, 2) in full-size px: local maxima of score, the emptiest cells first, min_distance apart."""
     h, w = score.shape
     columns = int(2 * w / cell) + 1
-    held = np.zeros((int(2 * h / cell) + 1) * columns, np.int64)
+    held = np.zeros((int(2 * h / cell) + 1) * columns, np.int64)  # corners by cell
     near = np.ones((h, w), np.bool_)  # may a corner be put here?
+    at, value = np.empty((h * w // 4, 2), np.int64), np.empty(h * w // 4)
+    n = candidates(score, tracked, min_distance, cell, columns, held, near, at, value)
+    best_first = at[np.argsort(-value[:n], kind='stable')]
+    return choose(best_first, count, min_distance, cell, columns, held, near)
+
+
+@kernel
+def candidates(score, tracked, min_distance, cell, columns, held, near, at, value):
+    """Fill at (N, 2) and value (N,) with the local maxima of score (H, W) far enough from tracked (M, 2), which are put
+    into held and near; returns how many there are."""
+    h, w = score.shape
     for i in range(len(tracked)):
         if 0.0 <= tracked[i, 0] < 2 * w and 0.0 <= tracked[i, 1] < 2 * h:
             held[int(tracked[i, 1] / cell) * columns + int(tracked[i, 0] / cell)] += 1
             block(near, 0.5 * tracked[i, 0], 0.5 * tracked[i, 1], 0.5 * min_distance)
-    at, value = np.empty((h * w // 4, 2), np.int64), np.empty(h * w // 4)
     n, zero, top = 0, np.float32(0.0), np.empty(w, np.bool_)
     for y in range(MARGIN, h - MARGIN):
         up, row, low, free = score[y - 1], score[y], score[y + 1], near[y]
@@ -81,33 +90,41 @@ def spread(score, tracked, count, min_distance, cell):
             if top[x]:
                 at[n, 0], at[n, 1], value[n] = x, y, row[x]
                 n += 1
-    order = np.argsort(-value[:n])
-    rank, first = np.empty(n, np.int64), np.zeros(held.max() + n + 2, np.int64)
+    return n
+
+
+@kernel
+def choose(at, count, min_distance, cell, columns, held, near):
+    """Up to count corners (N, 2) in full-size px of those at (M, 2), best first: their rank in their cell decides."""
+    n, most = len(at), 0
+    rank = np.empty(n, np.int64)
     for k in range(n):
-        home = int(2 * at[order[k], 1] / cell) * columns + int(2 * at[order[k], 0] / cell)
+        home = int(2 * at[k, 1] / cell) * columns + int(2 * at[k, 0] / cell)
         rank[k] = held[home]
         held[home] += 1
+        most = max(most, rank[k])
+    first = np.zeros(most + 2, np.int64)
+    for k in range(n):
         first[rank[k] + 1] += 1
     for r in range(1, len(first)):  # of rank r, by counting
         first[r] += first[r - 1]
     by_rank = np.empty(n, np.int64)
     for k in range(n):
-        by_rank[first[rank[k]]] = order[k]
+        by_rank[first[rank[k]]] = k
         first[rank[k]] += 1
-    chosen = np.empty((min(count, n), 2))
-    m = 0
+    chosen, m = np.empty((min(count, n), 2)), 0
     for k in by_rank:
-        x, y = at[k]
         if m == len(chosen):
             break
+        x, y = at[k, 0], at[k, 1]
         if near[y, x]:
             chosen[m, 0], chosen[m, 1] = 2.0 * x, 2.0 * y
-            block(near, x, y, 0.5 * min_distance)
+            block(near, float(x), float(y), 0.5 * min_distance)
             m += 1
     return chosen[:m]
 
 
-@kernel
+@inner
 def block(near, u, v, radius):
     """Clear the disc of radius around (u, v) in near (H, W)."""
     h, w = near.shape

@@ -2,6 +2,8 @@
 
 A segment (pixels of the undistorted canvas, see edge_sampling.py) runs from ends[0] to ends[1] and is always brighter
 on the side of its normal (-t_v, t_u), which fixes the order of its ends.
+
+np.int64(...) in calls: a kernel would be compiled anew for each literal.
 """
 from __future__ import annotations
 
@@ -45,8 +47,8 @@ def strip(view, ends, half, work):
     length = np.sqrt(du * du + dv * dv) + 1e-12
     (image, lens), places, index = view, work[0], work[6]
     du, dv, nu, nv = du / SAMPLES, dv / SAMPLES, -dv / length, du / length
-    place(lens, image.shape, ends[0, 0] + 0.5 * du, ends[0, 1] + 0.5 * dv, du, dv, nu, nv, half, 0, SAMPLES, places,
-          index)
+    u, v = ends[0, 0] + 0.5 * du, ends[0, 1] + 0.5 * dv
+    place(lens, image.shape, u, v, du, dv, nu, nv, half, np.int64(0), np.int64(SAMPLES), places, index)
     sample(image, places, half, work[2], index, work[7])
 
 
@@ -236,7 +238,7 @@ def measure(view, floor, half, a, b, ends, work):
     if line[4] < LOST:
         return line[4], 0.0, 0.0, 0.0
     shift(ends, a + line[0] - b - line[1], a + line[0] + b + line[1])
-    strip(view, ends, 3, work)
+    strip(view, ends, np.int64(3), work)
     first[:] = 0
     peaks(values, seen, first, 1, np.float32(floor), found, work[5])
     fit(found, 0.5, line)
@@ -255,9 +257,9 @@ def reach_ends(view, ends, floor, work):
     start, lanes = -min(INWARD, 0.4 * length), SAMPLES // 2
     for side, sign in enumerate((-1.0, 1.0)):
         u, v = ends[side, 0] + sign * start * tu, ends[side, 1] + sign * start * tv
-        place(lens, image.shape, u, v, sign * END_STEP * tu, sign * END_STEP * tv, -tv, tu, 3, side * lanes,
-              lanes, places, index)
-    sample(image, places, 3, values, index, work[7])
+        place(lens, image.shape, u, v, sign * END_STEP * tu, sign * END_STEP * tv, -tv, tu, np.int64(3),
+              side * lanes, lanes, places, index)
+    sample(image, places, np.int64(3), values, index, work[7])
     for side, sign in enumerate((-1.0, 1.0)):
         last, missed = start, 0
         for k in range(lanes):
@@ -277,7 +279,7 @@ def reach_ends(view, ends, floor, work):
 @kernel
 def remember(view, ends, profile, work):
     """Fill profile (WIDTH, SAMPLES) of a segment (2, 2)."""
-    strip(view, ends, HALF, work)
+    strip(view, ends, np.int64(HALF), work)
     normalise(work[2], work[1], profile, work[5])
 
 
@@ -308,19 +310,22 @@ def follow(view, floor, same, on_edge, shortest, slots, profiles, ends, motion, 
     """
     work, start = workspace(), np.empty((2, 2))
     for m in range(len(ends)):
-        profile, end, reach, tilt = profiles[slots[m]], ends[m], NEAR, NEAR_TILT
+        profile, end, reach, tilt = profiles[slots[m]], ends[m], np.int64(NEAR), np.int64(NEAR_TILT)
         score, a, b = search(view, profile, end, reach, tilt, work)
         if score < SURE or abs(a) == reach or abs(b) == tilt:
-            reach, tilt = FAR, FAR_TILT
+            reach, tilt = np.int64(FAR), np.int64(FAR_TILT)
             score, a, b = search(view, profile, end, reach, tilt, work)
         good[m] = False
         if not score > same:
             continue
-        start[:] = end
+        for k in range(2):
+            start[k, 0], start[k, 1] = end[k, 0], end[k, 1]
         support, variance[m, 0], variance[m, 1], height = measure(view, floor, reach + tilt + HALF, a, b, end, work)
         if not support > on_edge:
             continue
-        motion[m] += end - start
+        for k in range(2):
+            motion[m, k, 0] += end[k, 0] - start[k, 0]
+            motion[m, k, 1] += end[k, 1] - start[k, 1]
         reach_ends(view, end, max(floor, CLEAR * height), work)
         if length_of(end) > shortest:
             good[m] = True
@@ -330,13 +335,14 @@ def follow(view, floor, same, on_edge, shortest, slots, profiles, ends, motion, 
 @kernel
 def settle(view, floor, on_edge, shortest, wanted, ends, variance, good):
     """Put new segments ends (M, 2, 2) on their edges, in place, until as many as wanted are; see follow()."""
-    work, half, count = workspace(), PEAK + 2, 0
+    work, half, middle, count = workspace(), np.int64(PEAK + 2), np.int64(0), 0
     good[:] = False
     for m in range(len(ends)):
         if count == wanted:
             break
         strip(view, ends[m], half, work)
-        support, variance[m, 0], variance[m, 1], height = measure(view, floor, half, 0, 0, ends[m], work)
+        support, variance[m, 0], variance[m, 1], height = measure(view, floor, half, middle, middle, ends[m],
+                                                                      work)
         if support > on_edge:
             reach_ends(view, ends[m], max(floor, CLEAR * height), work)
             good[m] = length_of(ends[m]) > shortest

@@ -59,13 +59,13 @@ def match(previous, newest, start, turns, rotated, moved_on, slots, templates, m
         M[0, 0], M[0, 1] = T[1, 1] / determinant, -T[0, 1] / determinant
         M[1, 0], M[1, 1] = -T[1, 0] / determinant, T[0, 0] / determinant
         for way in range(2):
-            guess[:] = moved_on[i] if way == 0 else rotated[i]
-            if not abs(guess[0] + guess[1]) < np.inf:
-                guess[:] = start[i]
+            u, v = moved_on[i] if way == 0 else rotated[i]
+            known = abs(u + v) < np.inf
+            guess[0], guess[1] = u if known else start[i, 0], v if known else start[i, 1]
             if way == 1:
                 descend(previous, newest, start[i], M, guess, 1, SETTLED, patch, J)
-            here[:] = guess
             for p in range(2):
+                here[p] = guess[p]
                 for q in range(2):
                     A[p, q] = T[p, 0] * shapes[i, 0, q] + T[p, 1] * shapes[i, 1, q]
             score = align(image, templates[slot], moments[slot], inverses[slot], here, A, work)
@@ -73,11 +73,14 @@ def match(previous, newest, start, turns, rotated, moved_on, slots, templates, m
             if found[i]:
                 break
         if found[i] == 0:
-            here[:] = guess
+            here[0], here[1] = guess[0], guess[1]
             if not descend(previous, newest, start[i], M, here, 0, SETTLED, patch, J):
                 continue
             found[i], A[0, 0], A[0, 1], A[1, 0], A[1, 1] = 2, 1.0, 0.0, 0.0, 1.0
-        uv[i], shapes[i], back[:] = here, A, start[i]
+        for p in range(2):
+            uv[i, p], back[p] = here[p], start[i, p]
+            for q in range(2):
+                shapes[i, p, q] = A[p, q]
         good = border < here[0] < width - 1.0 - border and border < here[1] < height - 1.0 - border
         good = good and descend(newest, previous, here, T, back, 0, near_enough, patch, J)
         if not (good and (back[0] - start[i, 0])**2 + (back[1] - start[i, 1])**2 < round_trip * round_trip):

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from line_slam_ros.geometry.lie_kernels import retract_rotation
+from line_slam_ros.geometry.small_systems import solve_positive
 from line_slam_ros.kernel_cache import inner, kernel
 from line_slam_ros.types import F64
 
@@ -49,7 +50,7 @@ def _turn(R, x):
 @kernel
 def _fit_rotation(x1, x2, threshold, R):
     """Improve R (3, 3), in place, until R x1 best explains x2 (N, 2): Cauchy weights whose scale falls to threshold."""
-    J, A, b, e = np.empty((2, 3)), np.empty((3, 3)), np.empty(3), np.empty(2)
+    J, A, b, e, d = np.empty((2, 3)), np.empty((3, 3)), np.empty((3, 1)), np.empty(2), np.empty((3, 1))
     for step in range(8):
         scale = max(threshold, 0.2 * 0.5**step)
         A[:], b[:] = 0.0, 0.0
@@ -64,9 +65,12 @@ def _fit_rotation(x1, x2, threshold, R):
                 d2 = R[2, s] * xp - R[2, p] * xs
                 J[0, q] = (R[0, s] * xp - R[0, p] * xs - d2 * X0 / X2) / X2
                 J[1, q] = (R[1, s] * xp - R[1, p] * xs - d2 * X1 / X2) / X2
-            A += weight * (J.T @ J)
-            b += weight * (J.T @ e)
-        retract_rotation(R, np.linalg.solve(A, b), R)
+            for p in range(3):
+                b[p, 0] += weight * (J[0, p] * e[0] + J[1, p] * e[1])
+                for q in range(3):
+                    A[p, q] += weight * (J[0, p] * J[0, q] + J[1, p] * J[1, q])
+        solve_positive(A, b, d)
+        retract_rotation(R, d[:, 0], R)
 
 
 @inner
@@ -88,7 +92,7 @@ def _cost(X, x2, t, limit, best):
         for k in range(first, min(first + BLOCK, n)):
             n0, n1 = t[1] * X[2, k] - t[2] * X[1, k], t[2] * X[0, k] - t[0] * X[2, k]
             e = n0 * x2[0, k] + n1 * x2[1, k] + t[0] * X[1, k] - t[1] * X[0, k]
-            total += min(e * e / max(n0 * n0 + n1 * n1, 1e-24), limit)
+            total += min(e * e / (n0 * n0 + n1 * n1 + 1e-24), limit)
         if total > best:
             break
     return total
@@ -118,7 +122,8 @@ def _consensus(x1, x2, threshold, rotation_sigma, R, keep):
         length = np.sqrt(guess[0] ** 2 + guess[1] ** 2 + guess[2] ** 2)
         if length < 1e-14:
             continue
-        guess /= length
+        for p in range(3):
+            guess[p] /= length
         cost = _cost(X, seen, guess, 4.0 * threshold * threshold, best)
         if cost < best:
             best = cost
@@ -135,16 +140,14 @@ def _refine(x1, x2, threshold, rotation_sigma, R, t):
 
     r = x2 . (t x X1) / rho with rho = |(t x X1)_xy|; the small change of r through rho is left out.
     """
-    A, b, J, change, c = np.empty((5, 5)), np.empty(5), np.empty(5), np.zeros(3), np.empty(3)
+    A, b, d, J = np.empty((5, 5)), np.empty((5, 1)), np.empty((5, 1)), np.empty(5)
+    change, c, e1, e2 = np.zeros(3), np.empty(3), np.empty(3), np.empty(3)
     for _ in range(REFINEMENTS):
-        e1 = np.cross(t, np.array([1.0, 0.0, 0.0]) if abs(t[0]) < 0.7 else np.array([0.0, 1.0, 0.0]))
-        e1 /= np.sqrt(np.sum(e1 * e1))
-        e2 = np.cross(t, e1)
-        A[:] = 0.0
-        b[:] = 0.0
+        _axes_across(t, e1, e2)
+        A[:], b[:] = 0.0, 0.0
         for p in range(3):
             A[p, p] = (threshold / rotation_sigma) ** 2
-            b[p] = -A[p, p] * change[p]
+            b[p, 0] = -A[p, p] * change[p]
         A[3, 3] = A[4, 4] = 1e-9
         for i in range(len(x1)):
             X0, X1, X2 = _turn(R, x1[i])
@@ -165,17 +168,30 @@ def _refine(x1, x2, threshold, rotation_sigma, R, t):
             J[4] = (e2[0] * c[0] + e2[1] * c[1] + e2[2] * c[2]) / rho
             weight = 1.0 / (1.0 + (r / threshold) ** 2)
             for p in range(5):
-                b[p] -= weight * J[p] * r
+                b[p, 0] -= weight * J[p] * r
                 for q in range(p + 1):
                     A[p, q] += weight * J[p] * J[q]
-        for p in range(5):
-            for q in range(p):
-                A[q, p] = A[p, q]
-        d = np.linalg.solve(A, b)
-        change += d[:3]
-        retract_rotation(R, d[:3], R)
-        t += d[3] * e1 + d[4] * e2
-        t /= np.sqrt(np.sum(t * t))
-        if d[0] * d[0] + d[1] * d[1] + d[2] * d[2] < SETTLED * SETTLED * threshold * threshold \
-                and d[3] * d[3] + d[4] * d[4] < SETTLED * SETTLED:
+        solve_positive(A, b, d)  # of A it takes the lower triangle
+        retract_rotation(R, d[:3, 0], R)
+        turned, moved = 0.0, d[3, 0] * d[3, 0] + d[4, 0] * d[4, 0]
+        for p in range(3):
+            change[p] += d[p, 0]
+            turned += d[p, 0] * d[p, 0]
+            t[p] = (t[p] + d[3, 0] * e1[p] + d[4, 0] * e2[p]) / np.sqrt(1.0 + moved)
+        if turned < SETTLED * SETTLED * threshold * threshold and moved < SETTLED * SETTLED:
             break
+
+
+@inner
+def _axes_across(t, e1, e2):
+    """Fill e1, e2 (3,) with unit vectors at right angles to the unit vector t and to each other."""
+    if abs(t[0]) < 0.7:
+        e1[0], e1[1], e1[2] = 0.0, t[2], -t[1]
+    else:
+        e1[0], e1[1], e1[2] = -t[2], 0.0, t[0]
+    length = np.sqrt(e1[0] * e1[0] + e1[1] * e1[1] + e1[2] * e1[2])
+    for p in range(3):
+        e1[p] /= length
+    for p in range(3):
+        q, r = (p + 1) % 3, (p + 2) % 3
+        e2[p] = t[q] * e1[r] - t[r] * e1[q]

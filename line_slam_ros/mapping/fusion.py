@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from line_slam_ros.config import Mapping
+from line_slam_ros.geometry.small_systems import solve_positive
 from line_slam_ros.kernel_cache import inner, kernel
 from line_slam_ros.types import F64
 
@@ -187,7 +188,7 @@ def fuse(a, a_cov, a_ends, b, b_cov, b_ends, pluecker, cov, ends):
         sum_[i, i] += ROUNDING**2
         for j in range(4):
             sum_[i, j] += across[i, j]
-    _solve(sum_, across, gain)  # transposed
+    solve_positive(sum_, across, gain)  # transposed
     step, fused = mean_b - mean, np.empty((4, 4))
     for i in range(4):
         for j in range(4):
@@ -242,27 +243,6 @@ def _line_through(points, axes, across, pluecker, cov):
                 for j in range(4):
                     total += J[r, i] * across[i, j] * J[c, j]
             cov[r, c] = cov[c, r] = total
-
-
-@inner
-def _solve(A, B, X):
-    """X = A^-1 B for a positive definite A (N, N), which is overwritten by its Cholesky factor."""
-    size = len(A)
-    for i in range(size):
-        for j in range(i + 1):
-            for k in range(j):
-                A[i, j] -= A[i, k] * A[j, k]
-            A[i, j] = np.sqrt(A[i, i]) if i == j else A[i, j] / A[j, j]
-    for c in range(B.shape[1]):
-        for i in range(size):
-            X[i, c] = B[i, c]
-            for k in range(i):
-                X[i, c] -= A[i, k] * X[k, c]
-            X[i, c] /= A[i, i]
-        for i in range(size - 1, -1, -1):
-            for k in range(i + 1, size):
-                X[i, c] -= A[k, i] * X[k, c]
-            X[i, c] /= A[i, i]
 
 
 @inner
