@@ -64,7 +64,7 @@ class Estimator(Checked):
     """Sliding window optimisation."""
 
     window: int = param(13, 'states in the sliding window, keyframes and newest frame', 4, 40)
-    max_iterations: int = param(4, 'optimiser iterations per frame', 1, 50)
+    max_iterations: int = param(8, 'optimiser iterations per frame, at most', 1, 50)
     point_sigma_px: float = param(0.3, 'standard deviation of a tracked corner, px', 0.05, 20.0)
     line_representation: str = param('orthonormal', 'numbers that a line is estimated in; see docs/line-geometry.md',
                                      choices=LINE_FORMS)

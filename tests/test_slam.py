@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from line_slam_ros.config import Config
+from line_slam_ros.config import Estimator as EstimatorOptions
 from line_slam_ros.config import Points as PointOptions
 from line_slam_ros.simulation.features import Room, Sequence, Trajectory, calibration
 from line_slam_ros.slam import Slam
@@ -173,7 +174,8 @@ def test_after_a_loss_position_and_heading_go_on(mounting):
     T = np.eye(4)
     T[:3, :3] = mounting
     base = Sequence(Trajectory.random(7, rest=60.0), Room.random(7), calibration(), 8.0)
-    slam = Slam(Config(points=PointOptions(max_count=600)), replace(base.calibration, T_BC=T @ base.calibration.T_BC))
+    options = Config(points=PointOptions(max_count=600), estimator=EstimatorOptions(max_blind_m=0.02))
+    slam = Slam(options, replace(base.calibration, T_BC=T @ base.calibration.T_BC))
     slam.front_end = Told()
 
     def dark(t, observations, imu):

@@ -34,8 +34,8 @@ from line_slam_ros.types import F64, LineForm
 
 TRUSTED = 0.5  # of the predicted change of the cost: a smaller error, and the Jacobians serve for another step
 LEAST_DAMPING = 1e-9  # too small to matter
-CONVERGED = 3.0  # change of the cost (half squared standard deviations) below which iterating ends: of some 200 numbers
-# together, a sixth of a standard deviation each
+CONVERGED = 0.3  # change of the cost (half squared standard deviations) below which iterating ends: of some 200 numbers
+# together, a twentieth of a standard deviation each
 
 
 @kernel
