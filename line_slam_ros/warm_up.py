@@ -16,7 +16,7 @@ from line_slam_ros.estimation.bootstrap import Bootstrap
 from line_slam_ros.estimation.estimator import Estimator
 from line_slam_ros.frontend.front_end import FrontEnd
 from line_slam_ros.geometry.camera import Camera, warm_up_lenses
-from line_slam_ros.geometry.imu import between, turned
+from line_slam_ros.geometry.imu import turned
 from line_slam_ros.geometry.lie import quaternion_from_matrix
 from line_slam_ros.geometry.lie_kernels import retract_rotation
 from line_slam_ros.kernel_cache import cache_is_empty, fill
@@ -74,10 +74,8 @@ def warm_up_estimator(options: EstimatorOptions = EstimatorOptions()) -> None:  
     """A few simulated seconds: start from motion, optimise, marginalise."""
     sequence = Sequence(Trajectory.random(1), Room.random(1, points=300, lines=60), calibration(), 4.0, frame_rate=10.0)
     estimator = Estimator(options, sequence.calibration, 450.0, 300, 60)
-    bootstrap, started, previous = Bootstrap(estimator, sequence.calibration), False, 0
-    for observations, imu in sequence:
-        samples = between(imu, previous, observations.t_ns) if observations.t_ns else None
-        previous = observations.t_ns
+    bootstrap, started = Bootstrap(estimator, sequence.calibration), False
+    for observations, samples in sequence.steps():
         if not started:
             started = bootstrap.add(observations, samples, None)
         elif samples is not None:

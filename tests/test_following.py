@@ -11,7 +11,6 @@ from line_slam_ros.estimation.solver import retract_states
 from line_slam_ros.estimation.window import RIG, STATE, state_row
 from line_slam_ros.factors.line_reprojection import line_residual
 from line_slam_ros.factors.point_reprojection import inverse_depth_point, point_residual
-from line_slam_ros.geometry.imu import between
 from line_slam_ros.geometry.line_forms import move_line, world_line
 from line_slam_ros.simulation.features import Room, Sequence, Trajectory, calibration
 from line_slam_ros.types import LINE_FORMS
@@ -21,10 +20,8 @@ def followed(options=None, seconds=6.0):
     """An estimator that has just followed a frame, and what it was before that frame, with the frame."""
     sequence = Sequence(Trajectory.random(2), Room.random(2), calibration(), seconds)
     estimator = Estimator(options or Options(), sequence.calibration, 450.0, 700, 150)
-    bootstrap, started, previous, last = Bootstrap(estimator, sequence.calibration), False, None, None
-    for seen, imu in sequence:
-        samples = None if previous is None else between(imu, previous, seen.t_ns)
-        previous = seen.t_ns
+    bootstrap, started, last = Bootstrap(estimator, sequence.calibration), False, None
+    for seen, samples in sequence.steps():
         if not started:
             started = bootstrap.add(seen, samples, None)
             continue

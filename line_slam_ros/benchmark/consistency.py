@@ -19,12 +19,11 @@ from line_slam_ros.config import Mapping
 from line_slam_ros.estimation.bootstrap import Bootstrap
 from line_slam_ros.estimation.estimator import Estimator
 from line_slam_ros.estimation.stillness import Stillness
-from line_slam_ros.geometry.imu import between
 from line_slam_ros.geometry.lie import rigid, rigid_inverse, transform_points
 from line_slam_ros.mapping.fusion import worst_sigma
 from line_slam_ros.simulation.features import Room, Trajectory, calibration
 from line_slam_ros.simulation.features import Sequence as Simulated
-from line_slam_ros.types import F64, LineObservations, Observations, Samples
+from line_slam_ros.types import F64, LineObservations
 
 FOCAL_PX = 450.0  # of simulation.features.calibration
 MAX_POINTS, MAX_LINES = 700, 150
@@ -84,7 +83,8 @@ def simulate(world: World) -> Trace:
     bootstrap = Bootstrap(estimator, sequence.calibration)
     stillness = Stillness(FOCAL_PX, options.point_sigma_px)
     judge: Judge | None = None
-    for seen, samples in _frames(sequence, world.lines):
+    for seen, samples in sequence.steps():
+        seen = seen if world.lines else replace(seen, lines=NO_LINES)
         still = stillness.add(seen, samples)
         try:
             if judge is None:
@@ -102,15 +102,6 @@ def simulate(world: World) -> Trace:
             trace.failure = f'equations without a solution ({error})'
             break
     return trace
-
-
-def _frames(sequence: Simulated, lines: bool) -> Iterator[tuple[Observations, Samples | None]]:
-    """Observations and the inertial samples since the previous ones."""
-    previous = None
-    for seen, imu in sequence:
-        samples = None if previous is None else between(imu, previous, seen.t_ns)
-        previous = seen.t_ns
-        yield (seen if lines else replace(seen, lines=NO_LINES)), samples
 
 
 class Judge:

@@ -19,11 +19,10 @@ from line_slam_ros.config import Estimator as Options
 from line_slam_ros.config import Mapping
 from line_slam_ros.estimation.bootstrap import Bootstrap
 from line_slam_ros.estimation.estimator import Estimator
-from line_slam_ros.geometry.imu import between
 from line_slam_ros.mapping.line_map import LineMap
 from line_slam_ros.simulation.features import Room, Trajectory, calibration
 from line_slam_ros.simulation.features import Sequence as Simulated
-from line_slam_ros.types import F64, LineObservations, Observations, Samples
+from line_slam_ros.types import F64, LineObservations
 
 FOCAL_PX = 450.0  # of simulation.features.calibration
 USUAL = {'points': 120, 'lines': 30}  # seen at a time, while something else grows
@@ -95,7 +94,9 @@ def estimator_ms(points: int, lines: int, options: Options, seconds: float) -> d
     sequence = Simulated(Trajectory.random(3), room, calibration(), seconds, max_points=points)
     estimator = Estimator(options, sequence.calibration, FOCAL_PX, max(points, 1), max(lines, 1))
     bootstrap, started, spent = Bootstrap(estimator, sequence.calibration), False, defaultdict(list)
-    for seen, samples in _frames(sequence, lines):
+    for seen, samples in sequence.steps():
+        s = seen.lines
+        seen = replace(seen, lines=LineObservations(s.ids[:lines], s.ends[:lines], s.sigma[:lines]))
         if not started:
             started = bootstrap.add(seen, samples, None)
             continue
@@ -111,16 +112,6 @@ def estimator_ms(points: int, lines: int, options: Options, seconds: float) -> d
     if not spent:
         raise ValueError(f'the simulated run with {points} points and {lines} lines did not start in {seconds:g} s')
     return {stage: 1e3 * float(np.mean(values)) for stage, values in spent.items()}
-
-
-def _frames(sequence: Simulated, lines: int) -> Iterator[tuple[Observations, Samples | None]]:
-    """Observations with so many lines at most, and the inertial samples since the previous ones."""
-    previous = None
-    for seen, imu in sequence:
-        samples = None if previous is None else between(imu, previous, seen.t_ns)
-        previous = seen.t_ns
-        s = seen.lines
-        yield replace(seen, lines=LineObservations(s.ids[:lines], s.ends[:lines], s.sigma[:lines])), samples
 
 
 def map_curve(sizes: Sequence[int], publish: Callable[[F64], object], repeats: int = 15) -> Curve:

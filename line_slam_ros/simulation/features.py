@@ -12,8 +12,18 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from line_slam_ros.geometry.imu import between
 from line_slam_ros.geometry.lie import right_jacobian, so3_exp
-from line_slam_ros.types import F64, Calibration, ImuBatch, ImuNoise, LineObservations, Observations, PointObservations
+from line_slam_ros.types import (
+    F64,
+    Calibration,
+    ImuBatch,
+    ImuNoise,
+    LineObservations,
+    Observations,
+    PointObservations,
+    Samples,
+)
 
 GRAVITY_W = np.array([0.0, 0.0, -9.81])
 ROOM = np.array([6.0, 5.0, 2.5])  # m, walls at +- half in x and y, floor at 0
@@ -130,7 +140,7 @@ def imu_readings(motion: Motion, noise: ImuNoise, count: int, rate: float, rng: 
 
 @dataclass(frozen=True, slots=True)
 class Sequence:
-    """A simulated recording: iterate for (Observations, ImuBatch)."""
+    """A simulated recording: iterate for (Observations, ImuBatch), as Slam takes them."""
 
     trajectory: Trajectory
     room: Room
@@ -154,6 +164,13 @@ class Sequence:
             last = np.searchsorted(imu.t_ns, t_ns, side='left') + 1
             yield self.observe(t_ns, rng), ImuBatch(*(a[first:last] for a in (imu.t_ns, imu.gyro_B, imu.accel_B)))
             previous = t_ns
+
+    def steps(self) -> Iterator[tuple[Observations, Samples | None]]:
+        """As an estimator takes them: observations and the inertial samples since the previous ones, first None."""
+        previous = None
+        for seen, imu in self:
+            yield seen, None if previous is None else between(imu, previous, seen.t_ns)
+            previous = seen.t_ns
 
     def _imu(self, rng: np.random.Generator) -> ImuBatch:
         count = int(self.seconds * self.imu_rate) + 2

@@ -8,9 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 
 from line_slam_ros.geometry.camera import Camera
+from line_slam_ros.kernel_cache import inner, kernel
 from line_slam_ros.simulation.corridor import HEIGHT, TEXEL, TILE, Corridor
 from line_slam_ros.simulation.features import CAMERA_IN_BODY, Motion
 from line_slam_ros.types import F64, U8, Calibration
@@ -92,7 +92,7 @@ class Renderer:
         return self._sensor.expose(self._radiance)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@inner
 def _look(picture, x, y, left, right):
     """Bilinear value at x, y in texels; between columns left and right."""
     x, y = min(max(x - 0.5, left), right - 1.0), min(max(y - 0.5, 0.0), picture.shape[0] - 1.0)
@@ -102,7 +102,7 @@ def _look(picture, x, y, left, right):
             + fy * ((1.0 - fx) * picture[i + 1, j] + fx * picture[i + 1, j + 1]))
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel
 def _cast(rays, R_WC, p_WC, offsets, walls, picture, floor, ceiling, origin, radiance):
     """Fill radiance (H, W) with the means over samples (R_WC (S, 3, 3), p_WC (S, 3), offsets (S, 2) in the pixel).
 
