@@ -50,8 +50,8 @@ def here(monkeypatch, profile, shown):
     """Parts that take their runs over the recording from the fixtures: (what ran, its recording, variables)."""
     runs = []
 
-    def command(recording, **variables):
-        runs.append(('command', recording, variables))
+    def command(recording, cores=1, **variables):
+        runs.append((f'command on {cores}', recording, variables))
         return benchmark_speed.Command(0.5, 0.4, 200.0, 'compiling, which takes a minute\nsome poses')
 
     def work_here(work, *args, threads=1):
@@ -247,7 +247,8 @@ def test_parts_go_into_json_markdown_plots_and_reference(tmp_path, here):
     figures = json.loads(reference.read_text())[CLIP.name()]
     assert {name.partition(':')[0] for name in figures} == {'frames', 'startup', 'memory', 'growth'}
     assert all(value >= 0.0 for value in figures.values())
-    caches = [found['NUMBA_CACHE_DIR'] for what, clip, found in here if what == 'command' and clip.duration_s == 0.2]
+    started = f'command on {len(os.sched_getaffinity(0))}'
+    caches = [found['NUMBA_CACHE_DIR'] for what, clip, found in here if what == started and clip.duration_s == 0.2]
     assert len(caches) == 4 and len(set(caches)) == 1
     clips = [(clip.settings, clip.resize, threads) for what, clip, threads in here if what == 'profile']
     assert clips == [((), 1.0, 1), ((), 1.0, 2), (('points.max_count=50',), 1.0, 1), (('lines.max_count=20',), 1.0, 1),

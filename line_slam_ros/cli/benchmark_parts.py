@@ -1,6 +1,7 @@
 """The parts of ``line_slam benchmark speed``: each measures, and tells it as JSON, as Markdown and as figures."""
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
@@ -75,16 +76,17 @@ class Parts:
         return Part(document, '\n\n'.join([what, summary, *sections]), figures)
 
     def startup(self) -> Part:
-        """From the start of the process; the first with an empty cache fills it for the others."""
+        """From the start of the process, on all cores; the first with an empty cache fills it for the others."""
+        cores = len(os.sched_getaffinity(0))
         clip = replace(self._recording, duration_s=STARTUP_S)
         with TemporaryDirectory() as cache:
-            start = partial(benchmark_speed.replay_command, clip, NUMBA_CACHE_DIR=cache)
+            start = partial(benchmark_speed.replay_command, clip, cores, NUMBA_CACHE_DIR=cache)
             (cold, *warm), kernel = beside_kernel(lambda: [start() for _ in range(1 + WARM_STARTS)])
         typical = sorted(warm, key=lambda run: run.wall_s)[len(warm) // 2]
         document = {'cold': cold.used(), 'warm': [run.used() for run in warm], 'kernel_s': kernel._asdict()}
         figures = in_kernels('startup', {'cold, CPU': cold.cpu_s, 'warm, CPU': typical.cpu_s}, kernel.cpu)
         figures |= in_kernels('startup', {'cold, wall': cold.wall_s, 'warm, wall': typical.wall_s}, kernel.wall)
-        header = ['cache of compiled code', 's', 'of it CPU time']
+        header = ['cache of compiled code', f's, {cores} cores', 'CPU time']
         rows = [['empty', f'{cold.wall_s:.1f}', f'{cold.cpu_s:.1f}'],
                 ['filled', f'{typical.wall_s:.2f}', f'{typical.cpu_s:.2f}']]
         told = next((line for line in cold.log.splitlines() if 'compil' in line.lower()), '')

@@ -109,14 +109,14 @@ class Command:
         return {'wall_s': self.wall_s, 'cpu_s': self.cpu_s, 'peak_mib': self.peak_mib}
 
 
-def replay_command(recording: Recording, **variables: str) -> Command:
-    """On one core, figure and all. ValueError, with what it said, if it fails; variables: of the environment."""
+def replay_command(recording: Recording, cores: int = 1, **variables: str) -> Command:
+    """On so many cores, figure and all. ValueError, with what it said, if it fails; variables: of the environment."""
     with TemporaryDirectory() as scratch:
         words = ['replay', recording.bag, '--output', scratch, *(w for s in recording.settings for w in ('--set', s))]
         words += ['--calibration', recording.calibration] if recording.calibration else []
         words += ['--duration', recording.duration_s] if recording.duration_s is not None else []
         log = Path(scratch) / 'log.txt'
-        with surroundings(1, **IN_ORDER, **variables), log.open('w', encoding='utf-8') as stream:
+        with surroundings(cores, **IN_ORDER, **variables), log.open('w', encoding='utf-8') as stream:
             began = time.perf_counter()
             process = subprocess.Popen([sys.executable, '-m', 'line_slam_ros.cli.main', *map(str, words)],
                                        stdout=stream, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
