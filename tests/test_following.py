@@ -124,6 +124,19 @@ def test_what_is_left_unknown_of_a_landmark_is_noise(follower):
             np.testing.assert_allclose(sigma[i, k]**2, found, rtol=1e-3)
 
 
+def test_landmarks_without_an_estimate_say_nothing(follower):
+    """Whatever was in their rows of the solver's buffers before."""
+    w, solver = follower._solver.window, follower._solver
+    for table in (w.points, w.lines):
+        table.solved[table.count // 2:table.count] = False
+    evaluation(follower)(np.zeros(2 * STATE))
+    H, g = (a.copy() for a in follower._equations())
+    for table, kind in ((w.points, solver.points), (w.lines, solver.lines)):
+        kind.weight[table.count // 2:], kind.pull[table.count // 2:] = 1.0, 9.0
+    for after, before in zip(follower._equations(), (H, g), strict=True):
+        np.testing.assert_array_equal(after, before)
+
+
 def test_only_the_last_two_states_move(frame):
     after, before, (seen, samples, still) = frame
     before = copy.deepcopy(before)

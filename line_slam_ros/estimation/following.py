@@ -37,7 +37,7 @@ class Follower:
         self._t_ns = -1  # of the anchor; -1: there is none
         self._state = tuple(np.zeros((1, *a.shape[1:])) for a in (window.R, window.p, window.v, window.b))
         self._information, self._common = np.zeros((STATE, STATE)), np.zeros((STATE, STATE))
-        self._delta, self._sigma = np.zeros(RIG + STATE), (np.zeros(0), np.zeros(0))
+        self._delta, self._seen = np.zeros(RIG + STATE), tuple(np.zeros(0) for _ in range(6))
         self._pair = np.eye(2 * STATE)
         self._H, self._g = np.zeros_like(solver.H), np.zeros_like(solver.g)
         self._J, self._r = np.zeros((window.slots, 2, STATE, STATE)), np.zeros((window.slots, STATE))
@@ -122,8 +122,8 @@ class Follower:
             seen += table.solved[:table.count], now, np.ones((table.count, w.slots, 2))
         point_doubts(k, R[k], position[k], w.R_BC, w.p_BC, seen[1], p.z, p.sigma, p.abr, p.R_WA, p.p_WA, p.L, seen[2])
         line_doubts(k, R[k], position[k], w.R_BC, w.p_BC, seen[4], q.z, q.sigma, form, q.values, q.origin, q.L, seen[5])
-        self._sigma = seen[2], seen[5]
-        return tuple(seen)
+        self._seen = tuple(seen)
+        return self._seen
 
     def _evaluate(self, *seen: np.ndarray) -> float:
         """Residuals at the present estimate; returns the robust cost."""
@@ -149,32 +149,32 @@ class Follower:
         g[:STATE] += self._information @ self._delta[RIG:]
         R, p = s.exposed()
         seen = H[STATE:STATE + POSE, STATE:STATE + POSE], g[STATE:STATE + POSE]
-        add_points(n, R[n], p[n], w.R_BC, w.p_BC, w.points.count, w.points.z, self._sigma[0], w.points.abr,
+        add_points(n, R[n], p[n], w.R_BC, w.p_BC, self._seen[0], w.points.z, self._seen[2], w.points.abr,
                    w.points.R_WA, w.points.p_WA, s.points.weight, s.points.pull, *seen)
-        add_lines(n, R[n], p[n], w.R_BC, w.p_BC, w.lines.count, w.lines.z, self._sigma[1], int(o.line_form),
+        add_lines(n, R[n], p[n], w.R_BC, w.p_BC, self._seen[3], w.lines.z, self._seen[5], int(o.line_form),
                   w.lines.values, w.lines.origin, s.lines.weight, s.lines.pull, *seen)
         return H, g
 
 
 @kernel
-def add_points(slot, R, p, R_BC, p_BC, count, z, sigma, abr, R_WA, p_WA, weight, pull, H, g):
-    """Add what a slot's observations of the first count points say of its pose to H (6, 6) and g (6,)."""
+def add_points(slot, R, p, R_BC, p_BC, use, z, sigma, abr, R_WA, p_WA, weight, pull, H, g):
+    """Add what a slot's observations of points with use[i] say of its pose to H (6, 6) and g (6,)."""
     v, J_pose, J_rig, J_p = np.empty(2), np.empty((2, POSE)), np.empty((2, POSE)), np.empty((2, 3))
     p_W, C = np.empty(3), np.empty((3, 3))
-    for i in range(count):
-        if weight[i, slot] > 0.0:
+    for i in range(len(use)):
+        if use[i] and weight[i, slot] > 0.0:
             inverse_depth_point(R_WA[i], p_WA[i], abr[i], p_W, C)
             if point_reprojection(R, p, R_BC, p_BC, p_W, z[i, slot], v, J_pose, J_rig, J_p):
                 add_pose(J_pose, sigma[i, slot], weight[i, slot], pull[i, slot], H, g)
 
 
 @kernel
-def add_lines(slot, R, p, R_BC, p_BC, count, z, sigma, form, values, origin, weight, pull, H, g):
+def add_lines(slot, R, p, R_BC, p_BC, use, z, sigma, form, values, origin, weight, pull, H, g):
     """As add_points, for lines."""
     v, J_pose, J_rig, J_l = np.empty(2), np.empty((2, POSE)), np.empty((2, POSE)), np.empty((2, 6))
     n_W, d_W, C = np.empty(3), np.empty(3), np.empty((6, 4))
-    for i in range(count):
-        if weight[i, slot] > 0.0:
+    for i in range(len(use)):
+        if use[i] and weight[i, slot] > 0.0:
             world_line(form, values[i], origin[i], n_W, d_W, C)
             if line_reprojection(R, p, R_BC, p_BC, n_W, d_W, z[i, slot], v, J_pose, J_rig, J_l):
                 add_pose(J_pose, sigma[i, slot], weight[i, slot], pull[i, slot], H, g)
