@@ -39,7 +39,7 @@ def warm_up(front_end: FrontEnd, calibration: Calibration, config: Config, tell:
     LineMap.warm_up(config.mapping)
     warm_up_lenses()
     warm_up_front_end(front_end, calibration)
-    warm_up_estimator(config.estimator)
+    warm_up_estimator()
     fill()
 
 
@@ -70,10 +70,10 @@ def warm_up_shared() -> None:
     retract_rotation(np.eye(3), np.zeros(3), np.eye(3))
 
 
-def warm_up_estimator(options: EstimatorOptions = EstimatorOptions()) -> None:  # noqa: B008, it is frozen
-    """A few simulated seconds: start from motion, optimise, marginalise."""
+def warm_up_estimator() -> None:
+    """A few simulated seconds: start from motion, optimise, marginalise. To the kernels all options are but numbers."""
     sequence = Sequence(Trajectory.random(1), Room.random(1, points=300, lines=60), calibration(), 4.0, frame_rate=10.0)
-    estimator = Estimator(options, sequence.calibration, 450.0, 300, 60)
+    estimator = Estimator(EstimatorOptions(), sequence.calibration, 450.0, 300, 60)
     bootstrap, started = Bootstrap(estimator, sequence.calibration), False
     for observations, samples in sequence.steps():
         if not started:

@@ -45,7 +45,8 @@ def follower(frame):
 
 def evaluation(follower):
     """The cost as a function of a step (30,) from here, with what the newest state sees weighed once."""
-    w, seen = follower._solver.window, follower._newest()
+    w = follower._solver.window
+    follower._look()
     states = [a[w.n - 2:w.n] for a in (w.R, w.p, w.v, w.b)]
     start = [a.copy() for a in states]
 
@@ -53,7 +54,7 @@ def evaluation(follower):
         for a, s in zip(states, start, strict=True):
             a[:] = s
         retract_states(2, *states, np.concatenate([np.zeros(RIG), dx]))
-        return follower._evaluate(*seen)
+        return follower._evaluate()
 
     return cost
 
@@ -94,7 +95,8 @@ def test_hessian_is_how_the_gradient_changes():
 def test_what_is_left_unknown_of_a_landmark_is_noise(follower):
     """Against numerical derivatives of the residuals by the landmark."""
     w, solver, k = follower._solver.window, follower._solver, follower._solver.window.n - 1
-    _, points, point_sigma, _, lines, line_sigma = follower._newest()
+    follower._look()
+    _, points, point_sigma, _, lines, line_sigma = follower._seen
     R, p = solver.exposed()
     r, found = np.zeros(2), np.zeros(2)
 

@@ -103,7 +103,7 @@ def estimator_ms(points: int, lines: int, options: Options, seconds: float) -> d
         for stage, work in {'optimise': lambda seen=seen, samples=samples: estimator.step(seen, samples, False),
                             'covariance': estimator.covariance, 'lines for the map': estimator.lines,
                             'marginalise': estimator.marginalise}.items():
-            if work == estimator.lines and not estimator.newest_is_keyframe:
+            if stage == 'lines for the map' and not estimator.newest_is_keyframe:
                 continue
             began = time.process_time()
             work()

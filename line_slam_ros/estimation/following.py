@@ -76,8 +76,8 @@ class Follower:
         w, first = self._solver.window, self._solver.window.n - 2
         states = [a[first:w.n] for a in (w.R, w.p, w.v, w.b)]
         start, dx = [a.copy() for a in states], np.zeros(RIG + 2 * STATE)
-        seen = self._newest()
-        cost = self._evaluate(*seen)
+        self._look()
+        cost = self._evaluate()
         for _ in range(iterations):
             self._pair, g = self._equations()
             factor = cholesky(self._pair)
@@ -86,7 +86,7 @@ class Follower:
             dx[PAIR] = solve(factor, -g)
             predicted = -0.5 * float(g @ dx[PAIR])
             retract_states(2, *states, dx)
-            before, cost = cost, self._evaluate(*seen)
+            before, cost = cost, self._evaluate()
             if max(abs(before - cost), predicted) < SETTLED:
                 return True
         for a, s in zip(states, start, strict=True):
@@ -109,8 +109,8 @@ class Follower:
         given = np.linalg.inv(cholesky(self._pair)[STATE:, STATE:])
         return given @ given.T + T @ self._common @ T.T
 
-    def _newest(self) -> tuple[np.ndarray, ...]:
-        """What the newest state sees: of points (rows,) bool of those known, (rows, slots) bool of those seen and
+    def _look(self) -> None:
+        """Keep what the newest state sees: of points (rows,) bool of those known, (rows, slots) bool of those seen and
         (rows, slots, 2) of standard deviations, and the same of lines."""
         w, k, form = self._solver.window, self._solver.window.n - 1, int(self._solver.options.line_form)
         p, q = w.points, w.lines
@@ -123,15 +123,14 @@ class Follower:
         point_doubts(k, R[k], position[k], w.R_BC, w.p_BC, seen[1], p.z, p.sigma, p.abr, p.R_WA, p.p_WA, p.L, seen[2])
         line_doubts(k, R[k], position[k], w.R_BC, w.p_BC, seen[4], q.z, q.sigma, form, q.values, q.origin, q.L, seen[5])
         self._seen = tuple(seen)
-        return self._seen
 
-    def _evaluate(self, *seen: np.ndarray) -> float:
-        """Residuals at the present estimate; returns the robust cost."""
+    def _evaluate(self) -> float:
+        """Residuals, at the present estimate, of what the newest state sees; returns the robust cost."""
         s, w, g_W = self._solver, self._solver.window, self._solver.options.g_W
         a, n = w.n - 2, w.n - 1
         state_difference(1, w.R[a:n], w.p[a:n], w.v[a:n], w.b[a:n], *self._state, self._delta)
         delta = self._delta[RIG:]
-        return (0.5 * float(delta @ self._information @ delta) + s.landmark_cost(*seen)
+        return (0.5 * float(delta @ self._information @ delta) + s.landmark_cost(*self._seen)
                 + link_residuals(a, n, w.R, w.p, w.v, w.b, w.dt, w.dR, w.dp, w.dv, w.J_b, w.b_lin, w.W, w.w_b, g_W,
                                  self._r))
 
