@@ -90,7 +90,9 @@ def test_covariance_of_a_line_is_that_of_the_joint_equations_with_the_newest_pos
     w = solver.window
     solver.linearise(np.ones(POINTS, bool), np.ones(LINES, bool))
     kept = np.setdiff1d(np.arange(w.rows), state_row(w.n - 1) + np.arange(6))
-    found, seen = solver.line_covariances(np.arange(LINES)), np.zeros((column(w.n), w.rows))
+    scale = np.linspace(0.4, 2.0, LINES)  # of the noise: what is better than it was said to be is not believed to be
+    given, found = (solver.line_covariances(np.arange(LINES), s) for s in (np.ones(LINES), scale))
+    seen = np.zeros((column(w.n), w.rows))
     gather_rows = np.concatenate([np.arange(RIG), *(state_row(k) + np.arange(6) for k in range(w.n))])
     seen[np.arange(len(seen)), gather_rows] = 1.0
     for i in range(LINES):
@@ -100,7 +102,9 @@ def test_covariance_of_a_line_is_that_of_the_joint_equations_with_the_newest_pos
         joint = np.block([[states, W.T], [W, L @ L.T]])
         free = np.append(kept, w.rows + np.arange(4))
         expected = np.linalg.inv(joint[np.ix_(free, free)])[-4:, -4:]
-        np.testing.assert_allclose(found[i], expected, atol=1e-6 * np.abs(expected).max())
+        np.testing.assert_allclose(given[i], expected, atol=1e-6 * np.abs(expected).max())
+        more = np.linalg.inv(L @ L.T) * max(scale[i]**-2.0 - 1.0, 0.0)
+        np.testing.assert_allclose(found[i], expected + more, atol=1e-6 * np.abs(expected).max())
 
 
 def test_a_rig_that_is_not_estimated_stays_and_the_others_do_not_see_it(solver):
@@ -122,6 +126,7 @@ def test_a_rig_that_is_not_estimated_stays_and_the_others_do_not_see_it(solver):
 def test_equations_without_a_solution_are_told(solver):
     solver.linearise(np.ones(POINTS, bool), np.ones(LINES, bool))
     solver.H[:] = -solver.H
-    for ask in (lambda: solver.covariance(STATES - 1), lambda: solver.line_covariances(np.arange(LINES))):
+    some = np.arange(LINES), np.ones(LINES)
+    for ask in (lambda: solver.covariance(STATES - 1), lambda: solver.line_covariances(*some)):
         with pytest.raises(np.linalg.LinAlgError, match='positive definite'):
             ask()

@@ -146,7 +146,7 @@ class Estimator:
         w, t, n = self.window, self.window.lines, self.window.n
         rows = np.flatnonzero(t.solved[:t.count] & (t.taken[:t.count] >= 0))
         pluecker, J = unit_world_lines(int(self.solver.options.line_form), t.values[rows], t.origin[rows])
-        cov = J @ self.solver.line_covariances(t.taken[rows]) @ J.transpose(0, 2, 1)
+        cov = J @ self.solver.line_covariances(t.taken[rows], t.scale[rows]) @ J.transpose(0, 2, 1)
         R_WB, p_WB = self.solver.exposed()
         T_WC = rigid(R_WB @ w.R_BC, p_WB + R_WB @ w.p_BC)
         return WindowLines(t.ids[rows], pluecker, cov, t.views[rows] + t.seen[rows, :n].sum(axis=1),
@@ -189,6 +189,9 @@ class Estimator:
         if self._marginalised:
             self._undamp()
             self._follower.anchor(self.window.n - (1 if self.newest_is_keyframe else 2))
+        if not self.window.still[self.window.n - 1]:  # residuals at rest repeat each other
+            for table, kind in ((self.window.points, self.solver.points), (self.window.lines, self.solver.lines)):
+                table.learn_noise(self.window.n, kind.chi2, kind.pull, kind.weight, kind.size)
 
     def _borders_rest(self, slot: int) -> bool:
         """Whether a state is the first or last of a rest: those stay, and the links in between hold rest alone."""
@@ -247,7 +250,8 @@ class Estimator:
         for table, chi2 in ((w.points, self.solver.points.chi2), (w.lines, self.solver.lines.chi2)):
             c = table.count
             seen, solved = table.seen[:c, :n], table.solved[:c]
-            bad = seen & solved[:, None] & (chi2[:c, :n] > gate)
+            expected = np.minimum(table.scale[:c], 1.0)[:, None]  # what is more exact than it was said to be may err
+            bad = seen & solved[:, None] & (chi2[:c, :n] * expected**2 > gate)
             table.seen[:c, :n] &= ~bad
             views = table.seen[:c, :n].sum(axis=1)
             dead = bad.any(axis=1) & ((views < 2) | (bad.sum(axis=1) > views) | bad[:, n - 1])

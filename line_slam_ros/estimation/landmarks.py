@@ -3,7 +3,8 @@
 All that a camera sees are the rig and the poses, so landmarks fill a system of their own over the columns [rig, pose
 of slot 0, pose of slot 1, ...]. For landmark i, of d numbers (3 for a point, 4 for a line), and slot f the buffers hold
 
-    chi2, weight (M, slots), pull (M, slots, 2)   squared whitened residual (-1: none), its robust weight, their product
+    chi2, weight (M, slots), pull (M, slots, 2)   squared whitened residual (-1: none, inf: behind the camera), its
+                                                  robust weight, their product
     at, undo (M, slots)                           where in J its Jacobian is (-1: nowhere), 1 / sqrt(weight) then
     by_land (M, slots, 2, d)                      Jacobian by the landmark
     L (M, d, d), a (M, d)                         A = L L', the landmark's own Hessian, and its gradient
@@ -58,7 +59,7 @@ def point_residuals(n, R, p, R_BC, p_BC, use, seen, z, sigma, abr, R_WA, p_WA, c
                 cost += _weigh(r, sigma, i, f, c2, chi2, pull, weight)
             else:
                 cost += BEHIND
-                chi2[i, f] = BEHIND
+                chi2[i, f] = np.inf
     return 0.5 * cost
 
 

@@ -369,11 +369,13 @@ class Solver:
         latest = regular(cholesky(H[:rows, :rows]))[-STATE:, -STATE:]
         return latest.T @ latest
 
-    def line_covariances(self, lines: np.ndarray) -> F64:
+    def line_covariances(self, lines: np.ndarray, scale: F64) -> F64:
         """(L, 4, 4) of lines (rows when Jacobians were taken last) in their tangent, as the newest camera knows them.
 
         A^-1 + (A^-1 W) C (A^-1 W)' with W the ties to rig and poses and C the covariance of these, given the newest
-        pose: where that pose is in the world is not the line's doubt, how the others stood to it is.
+        pose: where that pose is in the world is not the line's doubt, how the others stood to it is. Where the scale
+        (L,) of a line's noise is less than one, A^-1 is that of the given noise: from how its views scatter nobody
+        learns in what all of them are wrong.
         """
         n, rows = self.window.n, self.window.rows
         H = self.H[:rows, :rows].copy()
@@ -385,4 +387,5 @@ class Solver:
         S = self._S[self.lines.first[lines, None] + np.arange(4), :len(seen)]
         inverse = np.linalg.inv(self.lines.L[lines]).transpose(0, 2, 1)
         AW = inverse @ S
-        return inverse @ inverse.transpose(0, 2, 1) + AW @ C @ AW.transpose(0, 2, 1)
+        own = inverse @ inverse.transpose(0, 2, 1) / np.minimum(scale, 1.0)[:, None, None]**2
+        return own + AW @ C @ AW.transpose(0, 2, 1)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from line_slam_ros.estimation.noise import Noise
 from line_slam_ros.geometry.imu import preintegrate
 from line_slam_ros.geometry.lie_kernels import log_so3, multiply_transposed
 from line_slam_ros.geometry.line_forms import VALUES
@@ -84,12 +85,13 @@ class LandmarkTable:
         self.ids = np.full(rows, -1, np.int64)
         self.seen = np.zeros((rows, slots), np.bool_)
         self.z = np.zeros((rows, slots, *observation))  # normalised image coordinates
-        self.sigma = np.ones((rows, slots, 2))  # their standard deviation
+        self.sigma = np.ones((rows, slots, 2))  # their standard deviation: as given, times the scale of the track
+        self.scale, self.noise = np.ones(rows), Noise()  # of each track's errors, and what is known of all: noise.py
         self.solved = np.zeros(rows, np.bool_)  # has a 3D estimate and takes part in the optimisation
         self.views = np.zeros(rows, np.int64)  # keyframes that ever saw it, also those that left the window
         self.taken = np.full(rows, -1, np.int64)  # its row when Jacobians were taken last; -1: not there
         # L (rows, d, d), a field of both: L L' is its Hessian, given the poses, at the last anchor (following.py)
-        self._columns = ['ids', 'seen', 'z', 'sigma', 'solved', 'views', 'taken', *fields]
+        self._columns = ['ids', 'seen', 'z', 'sigma', 'solved', 'views', 'taken', 'scale', *fields]
         for name, shape in fields.items():
             setattr(self, name, np.zeros((rows, *shape)))
 
@@ -109,11 +111,26 @@ class LandmarkTable:
         self.ids[rows[fresh]] = ids[fresh]
         self.count += len(fresh)
         used = rows >= 0
-        self.seen[rows[used], slot], self.z[rows[used], slot], self.sigma[rows[used], slot] = True, z[used], sigma[used]
+        self.seen[rows[used], slot], self.z[rows[used], slot] = True, z[used]
+        self.sigma[rows[used], slot] = sigma[used] * self.scale[rows[used], None]
 
     def _clear_rows(self, first: int, last: int) -> None:
         self.seen[first:last], self.solved[first:last] = False, False
-        self.views[first:last], self.taken[first:last] = 0, -1
+        self.views[first:last], self.taken[first:last], self.scale[first:last] = 0, -1, self.noise.typical
+
+    def learn_noise(self, n: int, chi2: F64, pull: F64, weight: F64, unknowns: int) -> None:
+        """Bring scales, standard deviations and chi2 to what the residuals of n states, just optimised, show.
+
+        chi2, weight (rows, slots), pull (rows, slots, 2): see landmarks.py; unknowns: numbers of a landmark.
+        """
+        c = self.count
+        scale, chi2, weight = self.scale[:c, None], chi2[:c, :n], weight[:c, :n]
+        told = self.solved[:c, None] & self.seen[:c, :n] & (weight > 0.0)
+        residuals = pull[:c, :n] * np.divide(scale, weight, out=np.zeros((c, n)), where=told)[..., None]
+        ratio = self.noise.learn(residuals, told, unknowns)[:, None] / scale
+        scale *= ratio
+        self.sigma[:c, :n] *= ratio[..., None]
+        np.divide(chi2, ratio**2, out=chi2, where=told)
 
     def remove_slot(self, slot: int, slots: int) -> None:
         """Forget what a slot saw and close the gap; slots = number of slots in use before."""
