@@ -6,7 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault('NUMBA_OPT', '2')  # numba reads it once: level 3 takes a quarter longer and gains nothing here
+# read by numba once: level 3 takes a quarter longer and gains nothing here, and of the errors that finding the types of
+# anything goes through, none is shown
+os.environ.setdefault('NUMBA_OPT', '2')
+os.environ.setdefault('NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING', '1')
 
 from numba import njit
 from numba.extending import register_jitable

@@ -2,10 +2,13 @@
 from __future__ import annotations
 
 import atexit
+import gc
 import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
+from multiprocessing import get_context
 
 import cv2
 import numpy as np
@@ -37,23 +40,31 @@ def warm_up(front_end: FrontEnd, calibration: Calibration, config: Config, tell:
         elsewhere(compile_all).wait()  # what it could not compile is compiled here, and its error comes up again
     warm_up_shared()
     LineMap.warm_up(config.mapping)
-    warm_up_lenses()
     warm_up_front_end(front_end, calibration)
     warm_up_estimator()
     fill()
 
 
 def compile_all() -> None:
-    """Every kernel, the estimator's beside by one more process where there is a core for it."""
+    """Every kernel, by as many processes as there are cores; each takes the next part when it is done with one."""
     warm_up_shared()  # first, and once: numba's cache is made for one writer
-    estimator = elsewhere(warm_up_estimator) if len(os.sched_getaffinity(0)) > 1 else None
-    warm_up_lenses()
-    warm_up_front_end(FrontEnd(Camera(calibration()), Config()), calibration())
-    LineMap.warm_up(Config().mapping)
-    if estimator is None:
-        warm_up_estimator()
-    else:
-        estimator.wait()
+    gc.set_threshold(100_000, 50, 50)  # the compiler makes millions of objects, and hardly any garbage in circles
+    parts, end = os.pipe()
+    os.write(end, bytes(range(len(PARTS))))
+    os.close(end)
+    cores = min(len(os.sched_getaffinity(0)), len(PARTS))
+    others = [get_context('fork').Process(target=compile_parts, args=(parts,)) for _ in range(cores - 1)]
+    for process in others:
+        process.start()
+    compile_parts(parts)
+    for process in others:
+        process.join()
+
+
+def compile_parts(parts: int) -> None:
+    """Those whose numbers this process is the first to read from a pipe."""
+    while part := os.read(parts, 1):
+        PARTS[part[0]]()
 
 
 def elsewhere(work: Callable[[], None]) -> subprocess.Popen:
@@ -64,7 +75,8 @@ def elsewhere(work: Callable[[], None]) -> subprocess.Popen:
 
 
 def warm_up_shared() -> None:
-    """What front end and estimator both need."""
+    """What several parts need."""
+    warm_up_lenses()
     quaternion_from_matrix(np.eye(3))
     turned(np.array([0.0, 0.1]), np.zeros((2, 3)), np.zeros(3))
     retract_rotation(np.eye(3), np.zeros(3), np.eye(3))
@@ -85,6 +97,21 @@ def warm_up_estimator() -> None:
             estimator.marginalise()
 
 
+def warm_up_points() -> None:
+    """The half of the front end that follows corners."""
+    warm_up_front_end(FrontEnd(Camera(calibration()), replace(Config(), use_lines=False)), calibration())
+
+
+def warm_up_lines() -> None:
+    """The half of the front end that follows segments."""
+    warm_up_front_end(FrontEnd(Camera(calibration()), replace(Config(), use_points=False)), calibration())
+
+
+def warm_up_map() -> None:
+    """The line map."""
+    LineMap.warm_up(Config().mapping)
+
+
 def warm_up_front_end(front_end: FrontEnd, calibration: Calibration) -> None:
     """Three shifted views of a random mosaic of rectangles."""
     rng = np.random.default_rng(0)
@@ -95,3 +122,6 @@ def warm_up_front_end(front_end: FrontEnd, calibration: Calibration) -> None:
     for k in range(3):
         view = np.ascontiguousarray(canvas[k:k + calibration.height, k:k + calibration.width])
         front_end.track(Frame(k + 1, view), None if k == 1 else np.eye(3))
+
+
+PARTS = warm_up_estimator, warm_up_points, warm_up_lines, warm_up_map  # disjoint; those that take longest first
