@@ -8,7 +8,7 @@ NEAREST = 0.05  # m from the camera: where a line that is seen cannot be
 SIGNIFICANT = 5.0  # standard deviations of an angle between observation planes that noise does not explain
 
 
-@inner
+@kernel
 def camera_pose(R_WB, p_WB, R_BC, p_BC, R_WC, p_WC):
     """T_WC = T_WB T_BC, written into R_WC (3, 3), p_WC (3,)."""
     for i in range(3):

@@ -82,7 +82,7 @@ def dot(a, b):
     return total
 
 
-@inner(fastmath=True)
+@kernel(fastmath=True)
 def gradient(patch, J):
     """Fill J[:3] (3, AREA) with the grey of a patch and its derivatives by u and v."""
     for y in range(SIZE):

@@ -51,6 +51,7 @@ def _turn(R, x):
 def _fit_rotation(x1, x2, threshold, R):
     """Improve R (3, 3), in place, until R x1 best explains x2 (N, 2): Cauchy weights whose scale falls to threshold."""
     J, A, b, e, d = np.empty((2, 3)), np.empty((3, 3)), np.empty((3, 1)), np.empty(2), np.empty((3, 1))
+    turn = np.empty(3)
     for step in range(8):
         scale = max(threshold, 0.2 * 0.5**step)
         A[:], b[:] = 0.0, 0.0
@@ -70,7 +71,9 @@ def _fit_rotation(x1, x2, threshold, R):
                 for q in range(3):
                     A[p, q] += weight * (J[0, p] * J[0, q] + J[1, p] * J[1, q])
         solve_positive(A, b, d)
-        retract_rotation(R, d[:, 0], R)
+        for p in range(3):
+            turn[p] = d[p, 0]
+        retract_rotation(R, turn, R)
 
 
 @inner
@@ -134,14 +137,14 @@ def _consensus(x1, x2, threshold, rotation_sigma, R, keep):
         keep[k] = abs(_epipolar_distance(_turn(R, x1[k]), x2[k], t)) < threshold
 
 
-@inner
+@kernel
 def _refine(x1, x2, threshold, rotation_sigma, R, t):
     """Gauss-Newton on R <- R Exp(d) (prior: no change, rotation_sigma) and on the direction t (3,), in place.
 
     r = x2 . (t x X1) / rho with rho = |(t x X1)_xy|; the small change of r through rho is left out.
     """
     A, b, d, J = np.empty((5, 5)), np.empty((5, 1)), np.empty((5, 1)), np.empty(5)
-    change, c, e1, e2 = np.zeros(3), np.empty(3), np.empty(3), np.empty(3)
+    change, turn, c, e1, e2 = np.zeros(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for _ in range(REFINEMENTS):
         _axes_across(t, e1, e2)
         A[:], b[:] = 0.0, 0.0
@@ -172,12 +175,13 @@ def _refine(x1, x2, threshold, rotation_sigma, R, t):
                 for q in range(p + 1):
                     A[p, q] += weight * J[p] * J[q]
         solve_positive(A, b, d)  # of A it takes the lower triangle
-        retract_rotation(R, d[:3, 0], R)
         turned, moved = 0.0, d[3, 0] * d[3, 0] + d[4, 0] * d[4, 0]
         for p in range(3):
-            change[p] += d[p, 0]
-            turned += d[p, 0] * d[p, 0]
+            turn[p] = d[p, 0]
+            change[p] += turn[p]
+            turned += turn[p] * turn[p]
             t[p] = (t[p] + d[3, 0] * e1[p] + d[4, 0] * e2[p]) / np.sqrt(1.0 + moved)
+        retract_rotation(R, turn, R)
         if turned < SETTLED * SETTLED * threshold * threshold and moved < SETTLED * SETTLED:
             break
 

@@ -158,7 +158,13 @@ class _Equidistant:
 @inner
 def _look_up(at, table_at, table):
     """Value of table at a place between those of the growing table_at, linear between; constant beyond them."""
-    k = min(max(np.searchsorted(table_at, at), 1), len(table) - 1)
+    k, beyond = 1, len(table)
+    while k + 1 < beyond:  # halving what is left
+        middle = (k + beyond) // 2
+        if table_at[middle - 1] < at:
+            k = middle
+        else:
+            beyond = middle
     share = (at - table_at[k - 1]) / (table_at[k] - table_at[k - 1])
     return table[k - 1] + min(max(share, 0.0), 1.0) * (table[k] - table[k - 1])
 

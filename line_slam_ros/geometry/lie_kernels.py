@@ -7,7 +7,7 @@ import numpy as np
 from line_slam_ros.kernel_cache import inner, kernel
 
 
-@inner
+@kernel
 def exp_so3(w, R):
     """Rotation vector w (3,) -> R (3, 3): Rodrigues, Taylor below 1e-4 rad."""
     x, y, z = w[0], w[1], w[2]

@@ -120,7 +120,7 @@ def unit_world_lines(form, values, origin_W):
     return L, J
 
 
-@inner
+@kernel
 def frame_of_line(n, d, U):
     """U (3, 3) of a line and phi, as orthonormal_from_pluecker: the longer of n, d keeps its direction."""
     nn, dd = np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]), np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
@@ -220,15 +220,17 @@ def _pin_to_host(n, d, R_WH, ends, U, values):
     for i in range(3):
         U[i, 1] = nm * (R_WH[i, 0] * m0 + R_WH[i, 1] * m1 + R_WH[i, 2])
         U[i, 2] = nq * (R_WH[i, 0] * q0 + R_WH[i, 1] * q1 + R_WH[i, 2] * q2)
-    U[0, 0], U[1, 0] = U[1, 1] * U[2, 2] - U[2, 1] * U[1, 2], U[2, 1] * U[0, 2] - U[0, 1] * U[2, 2]
-    U[2, 0] = U[0, 1] * U[1, 2] - U[1, 1] * U[0, 2]
-    c0, c1 = U[1, 1] * d[2] - U[2, 1] * d[1], U[2, 1] * d[0] - U[0, 1] * d[2]
-    c2 = U[0, 1] * d[1] - U[1, 1] * d[0]
-    along = c0 * n[0] + c1 * n[1] + c2 * n[2]
+    by_x, by_y, square, along = 0.0, 0.0, 0.0, 0.0
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        U[i, 0] = U[j, 1] * U[k, 2] - U[k, 1] * U[j, 2]
+        c = U[j, 1] * d[k] - U[k, 1] * d[j]
+        by_x += d[i] * U[i, 0]
+        by_y += d[i] * U[i, 1]
+        square += c * c
+        along += c * n[i]
     _write(U, values)
-    values[9] = np.arctan2(d[0] * U[0, 1] + d[1] * U[1, 1] + d[2] * U[2, 1],
-                           d[0] * U[0, 0] + d[1] * U[1, 0] + d[2] * U[2, 0])
-    values[10] = (c0 * c0 + c1 * c1 + c2 * c2) / along
+    values[9], values[10] = np.arctan2(by_y, by_x), square / along
     return along > 0.0 and values[10] > 1.0 / FURTHEST
 
 

@@ -88,7 +88,7 @@ def _runs_backwards(n, d, pose, ends):
     return (ends[1, 0] - ends[0, 0]) * (d0 - u * d2) + (ends[1, 1] - ends[0, 1]) * (d1 - v * d2) < 0.0
 
 
-@kernel
+@inner
 def _foot(n, d, pose, end, furthest, out):
     """out = [position along the line (m), its change per rad of the ray (m), distance across in the image].
 
