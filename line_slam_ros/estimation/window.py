@@ -57,8 +57,14 @@ def rig_difference(R_BC, p_BC, delay, R_given, p_given, delta):
 @kernel
 def whiten(cov, W):
     """W = L^-1 with L L' = cov, both (9, 9): W' W = cov^-1."""
-    L = np.linalg.cholesky(cov + 1e-14 * np.eye(9))
+    L = np.empty((9, 9))
     W[:] = 0.0
+    for i in range(9):
+        for j in range(i + 1):
+            t = cov[i, j]
+            for k in range(j):
+                t -= L[i, k] * L[j, k]
+            L[i, j] = np.sqrt(t + 1e-14) if i == j else t / L[j, j]
     for j in range(9):
         W[j, j] = 1.0 / L[j, j]
         for i in range(j + 1, 9):
