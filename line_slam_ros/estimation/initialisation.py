@@ -105,10 +105,9 @@ def _chain(links: list[tuple[float, F64, F64, F64, F64]]) -> _Motion:
 
 
 @inner
-def _coplanarity(x, y, R):
-    """Smallest eigenvalue of the scatter of f x R f' per match, x, y (N, 2); 0 when the bearings agree with R."""
-    M = np.zeros((3, 3))
-    n = np.empty(3)
+def _scatter(x, y, R, n, M):
+    """Fill M (3, 3) with the scatter of f x R f' per match, x, y (N, 2); n (3,): work space."""
+    M[:] = 0.0
     for k in range(len(x)):
         a0, a1, a2 = x[k, 0], x[k, 1], 1.0
         s = 1.0 / np.sqrt(a0 * a0 + a1 * a1 + 1.0)
@@ -120,17 +119,21 @@ def _coplanarity(x, y, R):
         for i in range(3):
             for j in range(3):
                 M[i, j] += n[i] * n[j]
-    return max(np.linalg.eigvalsh(M)[0], 0.0) / max(len(x), 1)
 
 
-@kernel
 def _disagreement(bias, x, y, first, dR, J, R_BC):
-    """Root coplanarity (P,) of P frame pairs, rotations corrected for a gyro bias (3,).
+    """Root coplanarity (P,) of P frame pairs, rotations corrected for a gyro bias (3,): 0 where bearings agree with it.
 
     Matches x, y (N, 2) of pair k stand from first[k] to first[k + 1]; dR (P, 3, 3) and J (P, 3, 3) are
     the preintegrated rotation and its derivative by the bias.
     """
-    out = np.empty(len(dR))
+    _scatters(bias, x, y, first, dR, J, R_BC, M := np.empty(dR.shape))
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(M)[:, 0], 0.0) / np.diff(first) + 1e-14)
+
+
+@kernel
+def _scatters(bias, x, y, first, dR, J, R_BC, M):
+    """Fill M (P, 3, 3), the smallest eigenvalues of which tell how far the bearings are from the rotations."""
     turn, E, A, R = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for k in range(len(dR)):
         for i in range(3):
@@ -139,8 +142,7 @@ def _disagreement(bias, x, y, first, dR, J, R_BC):
         multiply(dR[k], E, A)
         multiply(A, R_BC, E)
         multiply_transposed(R_BC, E, R)
-        out[k] = np.sqrt(_coplanarity(x[first[k]:first[k + 1]], y[first[k]:first[k + 1]], R) + 1e-14)
-    return out
+        _scatter(x[first[k]:first[k + 1]], y[first[k]:first[k + 1]], R, turn, M[k])
 
 
 def _gyro_bias(shots: list[Snapshot], links: list[tuple], R_BC: F64) -> F64:

@@ -72,12 +72,13 @@ def start_lines(n, R, p, R_BC, p_BC, todo, seen, z, sigma, min_sine, form, value
     for i in range(len(todo)):
         if not todo[i]:
             continue
-        M, views = np.zeros((4, 4)), 0
+        M, views, first = np.zeros((4, 4)), 0, 0
         for f in range(n):
             if not seen[i, f]:
                 continue
             camera_pose(R[f], p[f], R_BC, p_BC, R_WC, p_WC)
             if views == 0:
+                first = f
                 for k in range(3):
                     origin[i, k] = p_WC[k]
             a, b = z[i, f, 0], z[i, f, 1]
@@ -97,7 +98,6 @@ def start_lines(n, R, p, R_BC, p_BC, todo, seen, z, sigma, min_sine, form, value
             continue
         _, V = np.linalg.eigh(M)
         if _line_through(V[:, 0], V[:, 1], nd) and _in_front(n, R, p, R_BC, p_BC, seen[i], z[i], nd, origin[i]):
-            first = np.argmax(seen[i])
             camera_pose(R[first], p[first], R_BC, p_BC, R_WC, p_WC)
             solved[i] = store_line(form, nd[:3], nd[3:], R_WC, z[i, first], values[i])
 
