@@ -25,7 +25,8 @@ def kernel(function: Any = None, **options: Any) -> Any:
 def inner(function: Any = None, **options: Any) -> Any:
     """Decorator of what only kernels call: compiled into them, one version whatever constants they pass.
 
-    Half as long to compile as a kernel; called from Python it stays Python.
+    Half as long to compile as a kernel, but twice if kernels and inner ones call it: what is long and called by both is
+    better a kernel. Called from Python it stays Python.
     """
     decorate = register_jitable(error_model='numpy', no_cfunc_wrapper=True, **options)
     return decorate(function) if function else decorate
