@@ -53,11 +53,11 @@ def warm_up(front_end: FrontEnd, calibration: Calibration, config: Config, tell:
 
 def compile_all() -> None:
     """Every kernel, by as many processes as there are cores; each takes the next part when it is done with one."""
-    warm_up_shared()  # first, and once: numba's cache is made for one writer
     gc.set_threshold(100_000, 50, 50)  # the compiler makes millions of objects, and hardly any garbage in circles
     TargetConfig.__hash__ = lambda flags: 0  # dictionaries are asked by flags ten thousand times, and hold few of them
     TargetConfig.__eq__ = lambda flags, others: isinstance(others, TargetConfig) and (
         flags._values == others._values or flags.values() == others.values())
+    warm_up_shared()  # first, and once: numba's cache is made for one writer
     parts, end = os.pipe()
     os.write(end, bytes(range(len(PARTS))))
     os.close(end)
