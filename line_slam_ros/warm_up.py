@@ -4,6 +4,7 @@ from __future__ import annotations
 import atexit
 import gc
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,7 +13,6 @@ from multiprocessing import get_context
 
 import cv2
 import numpy as np
-from numba.core.targetconfig import TargetConfig
 
 from line_slam_ros.config import Config
 from line_slam_ros.config import Estimator as EstimatorOptions
@@ -54,9 +54,6 @@ def warm_up(front_end: FrontEnd, calibration: Calibration, config: Config, tell:
 def compile_all() -> None:
     """Every kernel, by as many processes as there are cores; each takes the next part when it is done with one."""
     gc.set_threshold(100_000, 50, 50)  # the compiler makes millions of objects, and hardly any garbage in circles
-    TargetConfig.__hash__ = lambda flags: 0  # dictionaries are asked by flags ten thousand times, and hold few of them
-    TargetConfig.__eq__ = lambda flags, others: isinstance(others, TargetConfig) and (
-        flags._values == others._values or flags.values() == others.values())
     warm_up_shared()  # first, and once: numba's cache is made for one writer
     parts, end = os.pipe()
     os.write(end, bytes(range(len(PARTS))))
@@ -77,9 +74,10 @@ def compile_parts(parts: int) -> None:
 
 
 def elsewhere(work: Callable[[], None]) -> subprocess.Popen:
-    """A function of this module at work in a process of its own, which ends with this one."""
-    process = subprocess.Popen([sys.executable, '-c', RUN.format(path=sys.path, work=work.__name__)])
-    atexit.register(process.kill)
+    """A function of this module at work in a process of its own, which ends with this one, and all that it forked."""
+    process = subprocess.Popen([sys.executable, '-c', RUN.format(path=sys.path, work=work.__name__)],
+                               start_new_session=True)
+    atexit.register(lambda: process.poll() is None and os.killpg(process.pid, signal.SIGKILL))
     return process
 
 
