@@ -27,6 +27,7 @@ LOST = 0.3  # support below which an edge is not measured on
 END_STEP, INWARD, OUTWARD, GAP = 2.0, 22.0, 8.0, 3  # px, px, px, steps: how an end looks for where its edge ends
 ROWS = 2 * PEAK + 5  # of work space: as many as rows of grey from which an edge is chosen
 CLEAR = 0.4  # of the mean height of an edge, below which it ends
+BLUR = 1.4  # px, standard deviation of what an edge is seen through: optics about 1, smoothing and slopes the rest
 ALONG = np.array([2.0 * (i + 0.5) / SAMPLES - 1.0 for i in range(SAMPLES)], np.float32)  # of the samples, -1 to 1
 
 
@@ -276,10 +277,42 @@ def reach_ends(view, ends, floor, work):
         ends[side, 1] += sign * last * tv
 
 
+@inner(fastmath=True)
+def displacement(values, seen, slopes):
+    """px that an edge in the middle row of values (WIDTH, SAMPLES) may be out of place because the other side of a thin
+    stripe is so near that both are seen as one: blur drives them apart. slopes (WIDTH,): work space.
+
+    Two opposite steps 2 a apart have their steepest places 2 x apart, a = x tanh(a x) in units of the blur: the root of
+    the derivative of the difference of two Gaussians. What is less steep than the edge moves it less.
+    """
+    worst = 0.0
+    for k in range(1, WIDTH - 1):
+        slope = np.float32(0.0)
+        for i in range(SAMPLES):
+            slope += seen[i] * (values[k + 1, i] - values[k - 1, i])
+        slopes[k] = slope
+    for side in range(-1, 2, 2):
+        for far in range(2, HALF - 1):
+            at = HALF + side * far
+            before, depth, after = -slopes[at - side], -slopes[at], -slopes[at + side]
+            if depth > 0.0 and depth >= before and depth > after:
+                apart = far + 0.5 * (before - after) / (before - depth - depth + after)
+                x = max(apart / (2.0 * BLUR), 1.0)
+                a = x
+                for _ in range(30):
+                    a = x * np.tanh(a * x)
+                worst = max(worst, min(depth / max(slopes[HALF], depth), 1.0) * BLUR * (x - a))
+                break
+    return worst
+
+
 @kernel
-def remember(view, ends, profile, work):
-    """Fill profile (WIDTH, SAMPLES) of a segment (2, 2)."""
+def remember(view, ends, profile, variance, work):
+    """Fill profile (WIDTH, SAMPLES) of a segment (2, 2); add its displacement to the variance (2,) px^2 of its ends."""
     strip(view, ends, np.int64(HALF), work)
+    push = displacement(work[2], work[1], work[5][0])
+    variance[0] += push * push
+    variance[1] += push * push
     normalise(work[2], work[1], profile, work[5])
 
 
@@ -329,7 +362,7 @@ def follow(view, floor, same, on_edge, shortest, slots, profiles, ends, motion, 
         reach_ends(view, end, max(floor, CLEAR * height), work)
         if length_of(end) > shortest:
             good[m] = True
-            remember(view, end, profile, work)
+            remember(view, end, profile, variance[m], work)
 
 
 @kernel
@@ -350,8 +383,9 @@ def settle(view, floor, on_edge, shortest, wanted, ends, variance, good):
 
 
 @kernel
-def learn(view, ends, slots, profiles):
-    """Fill rows slots (M,) of profiles (capacity, WIDTH, SAMPLES) with those of segments ends (M, 2, 2)."""
+def learn(view, ends, slots, profiles, variance):
+    """Fill rows slots (M,) of profiles (capacity, WIDTH, SAMPLES) with those of segments ends (M, 2, 2); see remember()
+    for variance (M, 2)."""
     work = workspace()
     for m in range(len(ends)):
-        remember(view, ends[m], profiles[slots[m]], work)
+        remember(view, ends[m], profiles[slots[m]], variance[m], work)
