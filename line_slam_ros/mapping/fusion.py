@@ -75,7 +75,8 @@ def _worst_sigma(pluecker, cov, ends):
     worst = 0.0
     for k in range(2):
         offsets(pluecker, cov, ends[k:k + 1], axes, mean, across)
-        difference = np.sqrt((across[0, 0] - across[1, 1]) ** 2 + 4.0 * across[0, 1] ** 2)
+        difference = across[0, 0] - across[1, 1]
+        difference = np.sqrt(difference * difference + 4.0 * (across[0, 1] * across[0, 1]))
         worst = np.maximum(worst, 0.5 * (across[0, 0] + across[1, 1] + difference))  # the larger one; NaN stays NaN
     return np.sqrt(worst)
 
@@ -99,14 +100,16 @@ def twin(pluecker, cov, ends, others, other_cov, other_ends, rows, gone, nearnes
 
 
 @kernel
-def within(low, high, ends, rows):
-    """How many of the segments (L, 2, 3) have boxes that touch the one from low to high (3,); fills rows with them."""
+def within(low, high, reach, ends, rows):
+    """How many of the segments (L, 2, 3) have boxes nearer than reach to the one from low to high (3,), along every
+    axis; fills rows with them."""
     count = 0
     for i in range(len(ends)):
         touches = True
         for c in range(3):  # no branches: this is for all of the map
             a, b = ends[i, 0, c], ends[i, 1, c]
-            touches &= ((a <= high[c]) | (b <= high[c])) & ((a >= low[c]) | (b >= low[c]))
+            least, most = low[c] - reach, high[c] + reach
+            touches &= ((a <= most) | (b <= most)) & ((a >= least) | (b >= least))
         rows[count] = i
         count += touches
     return count
@@ -149,12 +152,14 @@ def _agree(a, a_cov, a_ends, b, b_cov, b_ends, merge_distance):
         distance, total = 0.0, 0.0
         for c in range(3):
             axis[0, c] = foot[c] - p[0, c]
-            distance += axis[0, c] ** 2
+            distance += axis[0, c] * axis[0, c]
         distance = np.sqrt(distance)
-        axis /= max(distance, ROUNDING)
-        for line, cov in ((a, a_cov), (b, b_cov)):
-            offsets(line, cov, p, axis, mean, variance)
-            total += variance[0, 0]
+        for c in range(3):
+            axis[0, c] /= max(distance, ROUNDING)
+        offsets(a, a_cov, p, axis, mean, variance)
+        total += variance[0, 0]
+        offsets(b, b_cov, p, axis, mean, variance)
+        total += variance[0, 0]
         if not distance <= max(merge_distance, AGREEMENT * np.sqrt(total)):
             return False
     return True
@@ -186,13 +191,14 @@ def fuse(a, a_cov, a_ends, b, b_cov, b_ends, pluecker, cov, ends):
     for i in range(4):
         across[i, i] += ROUNDING**2
         sum_[i, i] += ROUNDING**2
+        mean_b[i] -= mean[i]
         for j in range(4):
             sum_[i, j] += across[i, j]
     solve_positive(sum_, across, gain)  # transposed
-    step, fused = mean_b - mean, np.empty((4, 4))
+    fused = np.empty((4, 4))
     for i in range(4):
         for j in range(4):
-            mean[i] += gain[j, i] * step[j]
+            mean[i] += gain[j, i] * mean_b[j]
             fused[i, j] = across[i, j]
             for k in range(4):
                 fused[i, j] -= gain[k, i] * across[k, j]
@@ -210,8 +216,12 @@ def fuse(a, a_cov, a_ends, b, b_cov, b_ends, pluecker, cov, ends):
 def _extent(d, a_ends, b_ends, points):
     """points (2, 3): where the union of two segments begins and ends along d, on the axis through the first's end."""
     origin = _along(a_ends[0], d)
-    low = min(origin, _along(a_ends[1], d), _along(b_ends[0], d), _along(b_ends[1], d)) - origin
-    high = max(origin, _along(a_ends[1], d), _along(b_ends[0], d), _along(b_ends[1], d)) - origin
+    low = high = origin
+    for ends in (a_ends, b_ends):
+        for k in range(2):
+            along = _along(ends[k], d)
+            low, high = min(low, along), max(high, along)
+    low, high = low - origin, high - origin
     for c in range(3):
         points[0, c] = a_ends[0, c] + low * d[c]
         points[1, c] = points[0, c] + max(high - low, ROUNDING) * d[c]
@@ -225,13 +235,12 @@ def _line_through(points, axes, across, pluecker, cov):
     for c in range(3):
         d[c] = (points[1, c] - p[c]) / length
     _cross(p, d, pluecker[:3])
-    J, turn = np.empty((6, 4)), np.empty((2, 3))
+    J, turn, moved = np.empty((6, 4)), np.empty((2, 3)), np.empty(3)
     for a in range(2):  # of the direction by the second point, and by the first with the other sign
         share = _along(axes[a], d)
         for c in range(3):
             turn[0, c] = (axes[a, c] - share * d[c]) / length
         _cross(p, turn[0], turn[1])
-        moved = np.empty(3)
         _cross(axes[a], d, moved)
         for c in range(3):
             J[c, a], J[3 + c, a] = moved[c] - turn[1, c], -turn[0, c]
@@ -249,7 +258,7 @@ def _line_through(points, axes, across, pluecker, cov):
 def _axes_across(d, axes):
     """axes (2, 3): unit vectors at right angles to the unit vector d and to each other."""
     least = 0 if abs(d[0]) <= min(abs(d[1]), abs(d[2])) else 1 if abs(d[1]) <= abs(d[2]) else 2
-    scale = 1.0 / np.sqrt(1.0 - d[least] ** 2)
+    scale = 1.0 / np.sqrt(1.0 - d[least] * d[least])
     for c in range(3):
         axes[0, c] = ((1.0 if c == least else 0.0) - d[least] * d[c]) * scale
     _cross(d, axes[0], axes[1])
@@ -267,7 +276,8 @@ def _foot(pluecker, p, foot):
 
 @inner
 def _length(ends):
-    return np.sqrt((ends[1, 0] - ends[0, 0]) ** 2 + (ends[1, 1] - ends[0, 1]) ** 2 + (ends[1, 2] - ends[0, 2]) ** 2)
+    x, y, z = ends[1, 0] - ends[0, 0], ends[1, 1] - ends[0, 1], ends[1, 2] - ends[0, 2]
+    return np.sqrt(x * x + y * y + z * z)
 
 
 @inner

@@ -77,12 +77,15 @@ def _merge(landmarks, namesakes, kept, near, gone, changed, stays):
     to_ids, to_pluecker, to_cov, to_ends, to_views, to_sigma = changed
     line, line_cov, line_ends = np.empty(6), np.empty((6, 6)), np.empty((2, 3))
     fused, fused_cov, fused_ends = np.empty(6), np.empty((6, 6)), np.empty((2, 3))
-    away, before = ~stays, np.arange(len(ids))
-    low, high, rows = np.full(3, np.inf), np.full(3, -np.inf), np.empty(len(kept_ids) + 1, np.int64)
+    away, before = np.ones(len(ids), np.bool_), np.empty(len(ids), np.int64)
+    low, high, rows = np.empty(3), np.empty(3), np.empty(len(kept_ids) + 1, np.int64)
+    for c in range(3):
+        low[c], high[c] = np.inf, -np.inf
     for i in range(len(ids)):
+        before[i] = i
         _widen(ends[i], low, high)
     reach = near[2] + near[1] / near[0]
-    count = within(low - reach, high + reach, kept_ends, rows)
+    count = within(low, high, reach, kept_ends, rows)
     for i in range(len(ids)):
         _copy(pluecker[i], cov[i], ends[i], line, line_cov, line_ends)
         line_id, line_views, line_sigma = ids[i], views[i], sigma[i]
@@ -90,20 +93,19 @@ def _merge(landmarks, namesakes, kept, near, gone, changed, stays):
             k, distance = twin(line, line_cov, line_ends, kept_pluecker, kept_cov, kept_ends, rows[:count], gone, near)
             j, nearer = twin(line, line_cov, line_ends, to_pluecker, to_cov, to_ends, before[:i], away, near)
             if nearer < distance:
-                line_sigma = fuse(to_pluecker[j], to_cov[j], to_ends[j], line, line_cov, line_ends,
-                                  fused, fused_cov, fused_ends)
+                twin_line, twin_cov, twin_ends = to_pluecker[j], to_cov[j], to_ends[j]
                 line_id, line_views, away[j] = min(line_id, to_ids[j]), line_views + to_views[j], True
             elif k >= 0:
-                line_sigma = fuse(kept_pluecker[k], kept_cov[k], kept_ends[k], line, line_cov, line_ends,
-                                  fused, fused_cov, fused_ends)
+                twin_line, twin_cov, twin_ends = kept_pluecker[k], kept_cov[k], kept_ends[k]
                 line_id, line_views, gone[k] = min(line_id, kept_ids[k]), line_views + kept_views[k], True
             else:
                 break
+            line_sigma = fuse(twin_line, twin_cov, twin_ends, line, line_cov, line_ends, fused, fused_cov, fused_ends)
             line, fused = fused, line
             line_cov, fused_cov = fused_cov, line_cov
             line_ends, fused_ends = fused_ends, line_ends
             if _widen(line_ends, low, high):
-                count = within(low - reach, high + reach, kept_ends, rows)
+                count = within(low, high, reach, kept_ends, rows)
         namesake = namesakes[i] if line_id == ids[i] else -1
         if _prevails(i, line_id, line_sigma, namesake, kept_sigma, gone, to_ids, to_sigma, away):
             _copy(line, line_cov, line_ends, to_pluecker[i], to_cov[i], to_ends[i])
