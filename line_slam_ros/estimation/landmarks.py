@@ -17,7 +17,7 @@ R, p are the bodies' poses when the images were taken, twist (n, 6) their [angul
 """
 import numpy as np
 
-from line_slam_ros.estimation.window import POSE, RIG, state_row
+from line_slam_ros.estimation.window import POSE, RIG, STATE, state_row
 from line_slam_ros.factors.line_reprojection import line_reprojection, line_residual
 from line_slam_ros.factors.point_reprojection import inverse_depth_point, point_reprojection, point_residual
 from line_slam_ros.factors.robust import CAUCHY, robust
@@ -251,34 +251,28 @@ def gradients(n, use, d, pull, at, undo, by_land, L, a, first, J, own, s):
             s[row + j] = t / L[i, j, j] if L[i, j, j] > 0.0 else 0.0
 
 
-@kernel
+def poses_of(n, x):
+    """The part (n, POSE) of x, over the rows of the window, that belongs to the poses of its slots: a view."""
+    return x[RIG:state_row(n)].reshape(n, STATE)[:, :POSE]
+
+
 def add_gradient(n, own, g):
     """Add the slots' pulls own (slots, LANES) to the gradient g of the window."""
-    for f in range(n):
-        for c in range(RIG):
-            g[c] += own[f, c]
-        for c in range(POSE):
-            g[state_row(f) + c] += own[f, RIG + c]
+    for pull in own[:n, :RIG]:
+        g[:RIG] += pull
+    poses_of(n, g)[:] += own[:n, RIG:RIG + POSE]
 
 
-@kernel
 def spread(n, q, g):
     """Add q (C,), over the columns that cameras see, to the gradient g of the window."""
-    for c in range(RIG):
-        g[c] += q[c]
-    for f in range(n):
-        for c in range(POSE):
-            g[state_row(f) + c] += q[column(f) + c]
+    g[:RIG] += q[:RIG]
+    poses_of(n, g)[:] += q[RIG:column(n)].reshape(n, POSE)
 
 
-@kernel
 def gather(n, dx, columns):
     """Fill columns (C,) with the parts of a step dx of the window that cameras see."""
-    for c in range(RIG):
-        columns[c] = dx[c]
-    for f in range(n):
-        for c in range(POSE):
-            columns[column(f) + c] = dx[state_row(f) + c]
+    columns[:RIG] = dx[:RIG]
+    columns[RIG:column(n)].reshape(n, POSE)[:] = poses_of(n, dx)
 
 
 @kernel

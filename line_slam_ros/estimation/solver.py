@@ -112,13 +112,11 @@ def exposures(n, R, p, v, rates, delay, R_exposed, p_exposed, twist):
         retract_rotation(R[k], turn, R_exposed[k])
 
 
-@kernel
 def retract_rig(R_BC, p_BC, delay, dx):
     """Apply a step dx (7,) to the rig in place."""
     retract_rotation(R_BC, dx[:3], R_BC)
-    for i in range(3):
-        p_BC[i] += dx[3 + i]
-    delay[0] += dx[6]
+    p_BC += dx[3:6]
+    delay += dx[6]
 
 
 @dataclass(frozen=True, slots=True)

@@ -58,7 +58,6 @@ def start_points(n, R, p, R_BC, p_BC, todo, seen, z, sigma, abr, R_WA, p_WA, rho
             solved[i] = True
 
 
-@kernel
 def start_lines(n, R, p, R_BC, p_BC, todo, seen, z, sigma, min_sine, form, values, origin, solved):
     """Lines of the rows in todo, in any form (geometry/line_forms.py), from all observation planes (multi-view SVD).
 
@@ -67,18 +66,30 @@ def start_lines(n, R, p, R_BC, p_BC, todo, seen, z, sigma, min_sine, form, value
     their noise explains (motion along the line, in its plane, or too short), an observed end lies behind a camera, or
     the form cannot hold the line.
     """
-    R_WC, p_WC, h, nd = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(6)
+    squares, first = np.zeros((len(todo), 4, 4)), np.full(len(todo), -1)
+    planes_of_lines(n, R, p, R_BC, p_BC, todo, seen, z, sigma, min_sine, origin, squares, first)
+    rows = np.flatnonzero(first >= 0)
+    if len(rows):
+        points = np.ascontiguousarray(np.linalg.eigh(squares[rows])[1][:, :, :2].transpose(0, 2, 1))
+        lines_of_points(rows, points, first, n, R, p, R_BC, p_BC, seen, z, form, values, origin, solved)
+
+
+@kernel
+def planes_of_lines(n, R, p, R_BC, p_BC, todo, seen, z, sigma, min_sine, origin, squares, first):
+    """Of the rows in todo, origin (M, 3), the first camera's centre, and squares (M, 4, 4), the sum of the planes' outer
+    products; first (M,) becomes the first view's slot where they meet at a sufficient angle."""
+    R_WC, p_WC, h = np.empty((3, 3)), np.empty(3), np.empty(3)
     normals, planes, noise2 = np.empty((n, 3)), np.empty(4), np.empty(n)
     for i in range(len(todo)):
         if not todo[i]:
             continue
-        M, views, first = np.zeros((4, 4)), 0, 0
+        views, earliest = 0, 0
         for f in range(n):
             if not seen[i, f]:
                 continue
             camera_pose(R[f], p[f], R_BC, p_BC, R_WC, p_WC)
             if views == 0:
-                first = f
+                earliest = f
                 for k in range(3):
                     origin[i, k] = p_WC[k]
             a, b = z[i, f, 0], z[i, f, 1]
@@ -93,13 +104,22 @@ def start_lines(n, R, p, R_BC, p_BC, todo, seen, z, sigma, min_sine, form, value
             views += 1
             for k in range(4):
                 for j in range(4):
-                    M[k, j] += planes[k] * planes[j]
-        if views < 2 or not has_parallax(normals, noise2, views, min_sine):
-            continue
-        _, V = np.linalg.eigh(M)
-        if _line_through(V[:, 0], V[:, 1], nd) and _in_front(n, R, p, R_BC, p_BC, seen[i], z[i], nd, origin[i]):
-            camera_pose(R[first], p[first], R_BC, p_BC, R_WC, p_WC)
-            solved[i] = store_line(form, nd[:3], nd[3:], R_WC, z[i, first], values[i])
+                    squares[i, k, j] += planes[k] * planes[j]
+        if views >= 2 and has_parallax(normals, noise2, views, min_sine):
+            first[i] = earliest
+
+
+@kernel
+def lines_of_points(rows, points, first, n, R, p, R_BC, p_BC, seen, z, form, values, origin, solved):
+    """Store the lines of these rows through points (len(rows), 2, 4) where no view sees them behind the camera."""
+    R_WC, p_WC, nd = np.empty((3, 3)), np.empty(3), np.empty(6)
+    for k in range(len(rows)):
+        i = rows[k]
+        f = first[i]
+        if _line_through(points[k, 0], points[k, 1], nd) \
+                and _in_front(n, R, p, R_BC, p_BC, seen[i], z[i], nd, origin[i]):
+            camera_pose(R[f], p[f], R_BC, p_BC, R_WC, p_WC)
+            solved[i] = store_line(form, nd[:3], nd[3:], R_WC, z[i, f], values[i])
 
 
 @inner

@@ -43,14 +43,12 @@ def state_difference(n, R, p, v, b, R0, p0, v0, b0, delta):
             delta[o + 9 + i] = b[k, i] - b0[k, i]
 
 
-@kernel
 def rig_difference(R_BC, p_BC, delay, R_given, p_given, delta):
     """delta (7,) = present rig minus the given one, which has no delay."""
     E = np.empty((3, 3))
     multiply_transposed(R_given, R_BC, E)
     log_so3(E, delta[:3])
-    for i in range(3):
-        delta[3 + i] = p_BC[i] - p_given[i]
+    delta[3:6] = p_BC - p_given
     delta[6] = delay[0]
 
 
