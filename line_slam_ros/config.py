@@ -65,7 +65,7 @@ class Estimator(Checked):
 
     window: int = param(13, 'states in the sliding window, keyframes and newest frame', 4, 40)
     max_iterations: int = param(8, 'optimiser iterations per frame, at most', 1, 50)
-    point_sigma_px: float = param(0.3, 'standard deviation of a tracked corner, px', 0.05, 20.0)
+    point_sigma_px: float = param(0.3, 'standard deviation of a tracked corner until it is learned, px', 0.05, 20.0)
     line_representation: str = param('orthonormal', 'numbers that a line is estimated in; see docs/line-geometry.md',
                                      choices=LINE_FORMS)
     line_min_views: int = param(3, 'states that must see a line before it gets a 3D estimate', 2, 20)

@@ -76,8 +76,8 @@ def start_lines(n, R, p, R_BC, p_BC, todo, seen, z, sigma, min_sine, form, value
 
 @kernel
 def planes_of_lines(n, R, p, R_BC, p_BC, todo, seen, z, sigma, min_sine, origin, squares, first):
-    """Of the rows in todo, origin (M, 3), the first camera's centre, and squares (M, 4, 4), the sum of the planes' outer
-    products; first (M,) becomes the first view's slot where they meet at a sufficient angle."""
+    """Of the rows in todo, origin (M, 3), the first camera's centre, and squares (M, 4, 4), the sum of their planes'
+    outer products; first (M,) becomes the first view's slot where the planes meet at a sufficient angle."""
     R_WC, p_WC, h = np.empty((3, 3)), np.empty(3), np.empty(3)
     normals, planes, noise2 = np.empty((n, 3)), np.empty(4), np.empty(n)
     for i in range(len(todo)):
