@@ -92,7 +92,7 @@ class Mapping(Checked):
     """What enters the line map."""
 
     min_views: int = param(4, 'keyframes that must have seen a line', 2, 1000)
-    max_sigma_m: float = param(0.014, 'largest standard deviation across the line at its ends, m', 1e-4, 10.0)
+    max_sigma_m: float = param(0.015, 'largest standard deviation across the line at its ends, m', 1e-4, 10.0)
     min_parallax_deg: float = param(1.0, 'smallest angle about the line between its extreme views, deg', 0.0, 90.0)
     min_length_m: float = param(0.05, 'shorter lines are not kept, m', 0.0, 10.0)
     max_range_m: float = param(50.0, 'ends further from the camera than this are not used, m', 0.5, 1e4)
