@@ -189,9 +189,6 @@ class Estimator:
         if self._marginalised:
             self._undamp()
             self._follower.anchor(self.window.n - (1 if self.newest_is_keyframe else 2))
-        if not self.window.still[self.window.n - 1]:  # residuals at rest repeat each other
-            for table, kind in ((self.window.points, self.solver.points), (self.window.lines, self.solver.lines)):
-                table.learn_noise(self.window.n, kind.chi2, kind.pull, kind.weight, kind.size)
 
     def _borders_rest(self, slot: int) -> bool:
         """Whether a state is the first or last of a rest: those stay, and the links in between hold rest alone."""
@@ -241,18 +238,21 @@ class Estimator:
                     int(o.line_form), q.values, q.origin, q.solved)
 
     def _cull(self) -> tuple[I64, I64]:
-        """Landmarks whose newest view fails the chi-square gate lose it.
+        """Landmarks whose newest view fails the chi-square gate lose it, and what is left tells of the noise.
 
         Those mostly wrong go for good, and so do lines that fell into a camera that sees them.
         """
         w, n = self.window, self.window.n
         gate, gone = self.options.gate_chi2, []
-        for table, chi2 in ((w.points, self.solver.points.chi2), (w.lines, self.solver.lines.chi2)):
-            c = table.count
+        learn = not (self._followed or w.still[n - 1])  # residuals at rest repeat each other
+        for table, kind in ((w.points, self.solver.points), (w.lines, self.solver.lines)):
+            c, chi2 = table.count, kind.chi2
             seen, solved = table.seen[:c, :n], table.solved[:c]
             expected = np.minimum(table.scale[:c], 1.0)[:, None]  # what is more exact than it was said to be may err
             bad = seen & solved[:, None] & (chi2[:c, :n] * expected**2 > gate)
             table.seen[:c, :n] &= ~bad
+            if learn:
+                table.learn_noise(n, kind.pull, kind.weight, kind.size)
             views = table.seen[:c, :n].sum(axis=1)
             dead = bad.any(axis=1) & ((views < 2) | (bad.sum(axis=1) > views) | bad[:, n - 1])
             gone.append(table.ids[:c][dead].copy())

@@ -122,19 +122,19 @@ class LandmarkTable:
         self.seen[first:last], self.solved[first:last] = False, False
         self.views[first:last], self.taken[first:last], self.scale[first:last] = 0, -1, self.noise.typical
 
-    def learn_noise(self, n: int, chi2: F64, pull: F64, weight: F64, unknowns: int) -> None:
-        """Bring scales, standard deviations and chi2 to what the residuals of n states, just optimised, show.
+    def learn_noise(self, n: int, pull: F64, weight: F64, unknowns: int) -> None:
+        """Bring scales and standard deviations to what the residuals of n states, just optimised, show.
 
-        chi2, weight (rows, slots), pull (rows, slots, 2): see landmarks.py; unknowns: numbers of a landmark.
+        weight (rows, slots), pull (rows, slots, 2): see landmarks.py; unknowns: numbers of a landmark.
         """
         c = self.count
-        scale, chi2, weight = self.scale[:c, None], chi2[:c, :n], weight[:c, :n]
+        scale, weight = self.scale[:c, None], weight[:c, :n]
         told = self.solved[:c, None] & self.seen[:c, :n] & (weight > 0.0)
-        residuals = pull[:c, :n] * np.divide(scale, weight, out=np.zeros((c, n)), where=told)[..., None]
+        per_weight = np.divide(scale, weight, out=np.zeros((c, n)), where=told)[..., None]
+        residuals = np.where(told[..., None], pull[:c, :n], 0.0) * per_weight
         ratio = self.noise.learn(residuals, told, unknowns)[:, None] / scale
         scale *= ratio
         self.sigma[:c, :n] *= ratio[..., None]
-        np.divide(chi2, ratio**2, out=chi2, where=told)
 
     def remove_slot(self, slot: int, slots: int) -> None:
         """Forget what a slot saw and close the gap; slots = number of slots in use before."""
@@ -181,8 +181,9 @@ class Window:
         self.lines = LandmarkTable(max_lines, slots, (2, 2), {'values': (VALUES,), 'origin': (3,), 'L': (4, 4)})
 
     def clear(self) -> None:
-        """Back to an empty window."""
+        """Back to an empty window, of which nothing is known."""
         self.n, self.points.count, self.lines.count = 0, 0, 0
+        self.points.noise, self.lines.noise = Noise(), Noise()  # what went astray may have taught anything
         self.samples.clear()
         self.prior_H[:], self.prior_g[:] = 0.0, 0.0
         self.R_BC[:], self.p_BC[:], self.delay[:] = *self.calibrated, 0.0
