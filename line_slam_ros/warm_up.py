@@ -16,7 +16,7 @@ import numpy as np
 
 from line_slam_ros.config import Config
 from line_slam_ros.config import Estimator as EstimatorOptions
-from line_slam_ros.estimation.bootstrap import Bootstrap
+from line_slam_ros.estimation.bootstrap import drive
 from line_slam_ros.estimation.estimator import Estimator
 from line_slam_ros.frontend.front_end import FrontEnd
 from line_slam_ros.geometry.camera import Camera, warm_up_lenses
@@ -93,15 +93,9 @@ def warm_up_estimator() -> None:
     """A few simulated seconds: start from motion, optimise, marginalise. To the kernels all options are but numbers."""
     sequence = Sequence(Trajectory.random(1), Room.random(1, points=300, lines=60), calibration(), 4.0, frame_rate=10.0)
     estimator = Estimator(EstimatorOptions(), sequence.calibration, 450.0, 300, 60)
-    bootstrap, started = Bootstrap(estimator, sequence.calibration), False
-    for observations, samples in sequence.steps():
-        if not started:
-            started = bootstrap.add(observations, samples, None)
-        elif samples is not None:
-            estimator.step(observations, samples, False)
-            estimator.covariance()
-            estimator.lines()
-            estimator.marginalise()
+    for _ in drive(estimator, sequence.calibration, sequence.steps()):
+        estimator.covariance()
+        estimator.lines()
 
 
 def warm_up_points() -> None:

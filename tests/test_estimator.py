@@ -9,11 +9,10 @@ import pytest
 from line_slam_ros.benchmark.consistency import World, simulate
 from line_slam_ros.config import Estimator as Options
 from line_slam_ros.estimation import solver as solver_module
-from line_slam_ros.estimation.bootstrap import MAX_UNSETTLED, Bootstrap
+from line_slam_ros.estimation.bootstrap import MAX_UNSETTLED, drive
 from line_slam_ros.estimation.estimator import Estimator
 from line_slam_ros.estimation.initialisation import upright
 from line_slam_ros.estimation.marginalisation import drop_state, eliminate
-from line_slam_ros.estimation.stillness import Stillness
 from line_slam_ros.estimation.window import state_row
 from line_slam_ros.geometry.imu import between
 from line_slam_ros.geometry.lie import rigid, so3_exp, so3_log
@@ -28,22 +27,18 @@ def run(sequence, options=None, change=lambda k, seen: seen, given=None):
     """Feeds a sequence; returns the estimator, times (s) and positions (N, 3), covariances of position, failures."""
     given = given or sequence.calibration
     estimator = Estimator(options or Options(), given, 450.0, 700, 150)
-    bootstrap, stillness = Bootstrap(estimator, given), Stillness(450.0, 0.3)
-    previous, started, out, failures = None, False, [], []
-    for k, (seen, imu) in enumerate(sequence):
-        seen = change(k, seen)
-        samples = None if previous is None else between(imu, previous, seen.t_ns)
-        previous = seen.t_ns
-        still = stillness.add(seen, samples)
-        if not started:
-            started = bootstrap.add(seen, samples, stillness.mean_imu() if still else None)
-        else:
-            estimator.step(seen, samples, still)
-        if started:
-            w = estimator.window
-            out.append((seen.t_ns * 1e-9, *w.p[w.n - 1], *np.diag(estimator.covariance())[3:6]))
-            failures.append(estimator.failure)
-            estimator.marginalise()
+    w, out, failures = estimator.window, [], []
+
+    def steps():
+        previous = None
+        for k, (seen, imu) in enumerate(sequence):
+            seen = change(k, seen)
+            yield seen, None if previous is None else between(imu, previous, seen.t_ns)
+            previous = seen.t_ns
+
+    for seen, _ in drive(estimator, given, steps()):
+        out.append((seen.t_ns * 1e-9, *w.p[w.n - 1], *np.diag(estimator.covariance())[3:6]))
+        failures.append(estimator.failure)
     out = np.array(out)
     return estimator, out[:, 0], out[:, 1:4], out[:, 4:7], failures
 

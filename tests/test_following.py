@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from line_slam_ros.config import Estimator as Options
-from line_slam_ros.estimation.bootstrap import Bootstrap
+from line_slam_ros.estimation.bootstrap import drive
 from line_slam_ros.estimation.estimator import Estimator
 from line_slam_ros.estimation.solver import retract_states
 from line_slam_ros.estimation.window import RIG, STATE, state_row
@@ -20,16 +20,16 @@ def followed(options=None, seconds=6.0):
     """An estimator that has just followed a frame, and what it was before that frame, with the frame."""
     sequence = Sequence(Trajectory.random(2), Room.random(2), calibration(), seconds)
     estimator = Estimator(options or Options(), sequence.calibration, 450.0, 700, 150)
-    bootstrap, started, last = Bootstrap(estimator, sequence.calibration), False, None
-    for seen, samples in sequence.steps():
-        if not started:
-            started = bootstrap.add(seen, samples, None)
-            continue
-        before = copy.deepcopy(estimator)
-        estimator.step(seen, samples, False)
+    given, last = [], None
+
+    def steps():
+        for seen, samples in sequence.steps():
+            given[:] = copy.deepcopy(estimator), (seen, samples, False)
+            yield seen, samples
+
+    for _ in drive(estimator, sequence.calibration, steps()):
         if estimator._followed:
-            last = copy.deepcopy(estimator), before, (seen, samples, False)
-        estimator.marginalise()
+            last = copy.deepcopy(estimator), *given
     return last
 
 

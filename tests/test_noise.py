@@ -3,10 +3,9 @@ import numpy as np
 import pytest
 
 from line_slam_ros.config import Estimator as Options
-from line_slam_ros.estimation.bootstrap import Bootstrap
+from line_slam_ros.estimation.bootstrap import drive
 from line_slam_ros.estimation.estimator import Estimator
 from line_slam_ros.estimation.noise import LEVELS, MOST_CORRELATED, VIEWS, Noise
-from line_slam_ros.estimation.stillness import Stillness
 from line_slam_ros.simulation.features import Room, Sequence, Trajectory, calibration
 
 UNKNOWNS = 3
@@ -80,14 +79,8 @@ def run(pixel_sigma, seconds=6.0, rest=0.0, told=0.3):
     """An estimator that was told another noise than there is, after so many seconds."""
     sequence = Sequence(Trajectory.random(2, rest), Room.random(2), calibration(), seconds, pixel_sigma=pixel_sigma)
     estimator = Estimator(Options(point_sigma_px=told), sequence.calibration, 450.0, 700, 150)
-    bootstrap, still, started = Bootstrap(estimator, sequence.calibration), Stillness(450.0, told), False
-    for seen, samples in sequence.steps():
-        rests = still.add(seen, samples)
-        if not started:
-            started = bootstrap.add(seen, samples, still.mean_imu() if rests else None)
-            continue
-        estimator.step(seen, samples, rests)
-        estimator.marginalise()
+    for _ in drive(estimator, sequence.calibration, sequence.steps()):
+        pass
     return estimator
 
 
@@ -123,24 +116,21 @@ def test_a_gross_error_is_an_outlier_and_teaches_nothing():
     """Also in a keyframe, where the window is optimised: the track must not explain it by noise of its own."""
     estimator, sequence = Estimator(Options(keyframe_parallax_px=0.5), calibration(), 450.0, 700, 150), Sequence(
         Trajectory.random(2), Room.random(2), calibration(), 5.0)
-    bootstrap, started, wrong, found = Bootstrap(estimator, sequence.calibration), False, None, []
-    for seen, samples in sequence.steps():
-        if not started:
-            started = bootstrap.add(seen, samples, None)
-            continue
-        table, n = estimator.window.points, estimator.window.n
-        if wrong is None and seen.t_ns > 4_000_000_000:
-            views = table.seen[:table.count, :n].sum(axis=1)
-            old = table.ids[:table.count][table.solved[:table.count] & (views >= 8)]
-            wrong = int(np.intersect1d(old, seen.points.ids)[0])
-            seen.points.x[seen.points.ids == wrong] += 50.0 / 450.0
-            found, _ = estimator.step(seen, samples, False)
+    table, at_ns, wrong = estimator.window.points, 4_050_000_000, []
+
+    def steps():
+        for seen, samples in sequence.steps():
+            if seen.t_ns == at_ns:
+                old = table.solved[:table.count] & (table.seen[:table.count].sum(axis=1) >= 8)
+                wrong.append(np.intersect1d(table.ids[:table.count][old], seen.points.ids)[0])
+                seen.points.x[seen.points.ids == wrong[0]] += 50.0 / 450.0
+            yield seen, samples
+
+    for seen, (outliers, _) in drive(estimator, sequence.calibration, steps()):
+        if seen.t_ns == at_ns:
             assert estimator.newest_is_keyframe
-        else:
-            estimator.step(seen, samples, False)
-        estimator.marginalise()
-    assert wrong in found
-    assert estimator.window.points.noise.level < 1.2
+            assert wrong[0] in outliers
+    assert wrong and table.noise.level < 1.2
 
 
 def test_a_new_start_knows_nothing_of_the_noise():

@@ -16,9 +16,8 @@ import numpy as np
 from line_slam_ros.benchmark.nees import gauge, line_nees, state_nees
 from line_slam_ros.config import Estimator as Options
 from line_slam_ros.config import Mapping
-from line_slam_ros.estimation.bootstrap import Bootstrap
+from line_slam_ros.estimation.bootstrap import drive
 from line_slam_ros.estimation.estimator import Estimator
-from line_slam_ros.estimation.stillness import Stillness
 from line_slam_ros.geometry.lie import rigid, rigid_inverse, transform_points
 from line_slam_ros.mapping.fusion import worst_sigma
 from line_slam_ros.simulation.features import Room, Trajectory, calibration
@@ -80,27 +79,16 @@ def simulate(world: World) -> Trace:
     sequence, trace = world.sequence(), Trace(world, 'never started')
     options = replace(world.options, point_sigma_px=world.pixel_sigma)
     estimator = Estimator(options, sequence.calibration, FOCAL_PX, MAX_POINTS, MAX_LINES)
-    bootstrap = Bootstrap(estimator, sequence.calibration)
-    stillness = Stillness(FOCAL_PX, options.point_sigma_px)
+    steps = ((seen if world.lines else replace(seen, lines=NO_LINES), samples) for seen, samples in sequence.steps())
     judge: Judge | None = None
-    for seen, samples in sequence.steps():
-        seen = seen if world.lines else replace(seen, lines=NO_LINES)
-        still = stillness.add(seen, samples)
-        try:
-            if judge is None:
-                if not bootstrap.add(seen, samples, stillness.mean_imu() if still else None):
-                    continue
-                judge, trace.failure = Judge(sequence, estimator), ''
-            else:
-                estimator.step(seen, samples, still)
-            trace.failure = estimator.failure
+    try:
+        for _ in drive(estimator, sequence.calibration, steps):
+            judge, trace.failure = judge or Judge(sequence, estimator), estimator.failure
             if trace.failure:
                 break
             judge.record(trace)
-            estimator.marginalise()
-        except np.linalg.LinAlgError as error:
-            trace.failure = f'equations without a solution ({error})'
-            break
+    except np.linalg.LinAlgError as error:
+        trace.failure = f'equations without a solution ({error})'
     return trace
 
 

@@ -1,6 +1,7 @@
 """Collects frames until the estimator can start, and says what it waits for."""
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 
 import numpy as np
@@ -8,9 +9,9 @@ import numpy as np
 from line_slam_ros.estimation.estimator import Estimator
 from line_slam_ros.estimation.initialisation import Snapshot, Start, merge_samples, start_in_motion, upright
 from line_slam_ros.estimation.shift import matches
-from line_slam_ros.estimation.stillness import SPAN_S
+from line_slam_ros.estimation.stillness import SPAN_S, Stillness
 from line_slam_ros.geometry.lie import so3_exp
-from line_slam_ros.types import F64, Calibration, Observations, Samples
+from line_slam_ros.types import F64, I64, Calibration, Observations, Samples
 
 MIN_MATCHES = 10  # corners; their motion between two images has five unknowns
 MIN_PARALLAX_PX = 15.0  # median shift, rotation included, between first and last frame
@@ -142,3 +143,22 @@ class Bootstrap:
         if sigma > self._options.init_max_scale_sigma:
             return f'metric scale: known to {100 * sigma:.0f} %, accelerate the camera'
         return ''
+
+
+def drive(estimator: Estimator, calibration: Calibration, steps: Iterable[tuple[Observations, Samples | None]],
+          ) -> Iterator[tuple[Observations, tuple[I64, I64]]]:
+    """Feed an estimator frames, each with the samples since the one before.
+
+    Yields, from the start on and before anything is marginalised, the frame and which points and lines were wrong.
+    """
+    bootstrap, outliers = Bootstrap(estimator, calibration), (np.empty(0, np.int64), np.empty(0, np.int64))
+    stillness, started = Stillness(estimator.focal, estimator.options.point_sigma_px), False
+    for seen, samples in steps:
+        still = stillness.add(seen, samples)
+        if started and samples is not None:
+            outliers = estimator.step(seen, samples, still)
+        else:
+            started = bootstrap.add(seen, samples, stillness.mean_imu() if still else None)
+        if started:
+            yield seen, outliers
+            estimator.marginalise()
