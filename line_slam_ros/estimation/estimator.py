@@ -146,7 +146,7 @@ class Estimator:
         w, t, n = self.window, self.window.lines, self.window.n
         rows = np.flatnonzero(t.solved[:t.count] & (t.taken[:t.count] >= 0))
         pluecker, J = unit_world_lines(int(self.solver.options.line_form), t.values[rows], t.origin[rows])
-        cov = J @ self.solver.line_covariances(t.taken[rows], t.scale[rows]) @ J.transpose(0, 2, 1)
+        cov = J @ self.solver.line_covariances(t.taken[rows]) @ J.transpose(0, 2, 1)
         R_WB, p_WB = self.solver.exposed()
         T_WC = rigid(R_WB @ w.R_BC, p_WB + R_WB @ w.p_BC)
         return WindowLines(t.ids[rows], pluecker, cov, t.views[rows] + t.seen[rows, :n].sum(axis=1),
@@ -167,7 +167,12 @@ class Estimator:
         self._followed = self._may_follow() and self._follower.follow(self.options.max_iterations)
         if not self._followed:
             self._optimise()
-        outliers = self._cull()
+        kinds = (w.points, self.solver.points), (w.lines, self.solver.lines)
+        wrong = [self._contradicted(table, kind.chi2) for table, kind in kinds]
+        if not (self._followed or still):  # residuals at rest repeat each other
+            for table, kind in kinds:
+                table.learn_noise(w.n, kind.pull, kind.weight, kind.size)
+        outliers = self._cull(*wrong)
         self.failure = self._health()
         return outliers
 
@@ -237,25 +242,23 @@ class Estimator:
         start_lines(n, R, position, w.R_BC, w.p_BC, todo, q.seen, q.z, q.sigma, min_sine,
                     int(o.line_form), q.values, q.origin, q.solved)
 
-    def _cull(self) -> tuple[I64, I64]:
-        """Landmarks whose newest view fails the chi-square gate lose it, and what is left tells of the noise.
+    def _contradicted(self, table: LandmarkTable, chi2: F64) -> np.ndarray:
+        """Which views (rows, n) fail the chi-square gate; their landmarks lose them."""
+        seen, n = table.seen[:table.count], self.window.n
+        expected = np.minimum(table.scale[:table.count], 1.0)[:, None]  # what is more exact than given may err as given
+        wrong = table.solved[:table.count, None] & (expected**2 * chi2[:table.count] > self.options.gate_chi2)
+        wrong = seen[:, :n] & wrong[:, :n]
+        seen[:, :n] &= ~wrong
+        return wrong
 
-        Those mostly wrong go for good, and so do lines that fell into a camera that sees them.
-        """
-        w, n = self.window, self.window.n
-        gate, gone = self.options.gate_chi2, []
-        learn = not (self._followed or w.still[n - 1])  # residuals at rest repeat each other
-        for table, kind in ((w.points, self.solver.points), (w.lines, self.solver.lines)):
-            c, chi2 = table.count, kind.chi2
-            seen, solved = table.seen[:c, :n], table.solved[:c]
-            expected = np.minimum(table.scale[:c], 1.0)[:, None]  # what is more exact than it was said to be may err
-            bad = seen & solved[:, None] & (chi2[:c, :n] * expected**2 > gate)
-            table.seen[:c, :n] &= ~bad
-            if learn:
-                table.learn_noise(n, kind.pull, kind.weight, kind.size)
-            views = table.seen[:c, :n].sum(axis=1)
-            dead = bad.any(axis=1) & ((views < 2) | (bad.sum(axis=1) > views) | bad[:, n - 1])
-            gone.append(table.ids[:c][dead].copy())
+    def _cull(self, wrong_points: np.ndarray, wrong_lines: np.ndarray) -> tuple[I64, I64]:
+        """Landmarks whose newest view (rows, n) was wrong, or most views, go for good, and so do lines that fell into
+        a camera that sees them. Returns their ids."""
+        w, n, gone = self.window, self.window.n, []
+        for table, wrong in ((w.points, wrong_points), (w.lines, wrong_lines)):
+            views = table.seen[:table.count, :n].sum(axis=1)
+            dead = wrong.any(axis=1) & ((views < 2) | (wrong.sum(axis=1) > views) | wrong[:, n - 1])
+            gone.append(table.ids[:table.count][dead].copy())
             table.keep(~dead)
         R, position = self.solver.exposed()
         q, inside = w.lines, np.zeros(w.lines.count, np.bool_)

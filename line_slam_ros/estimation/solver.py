@@ -141,7 +141,7 @@ class _Landmarks:
         self.at, self.undo = np.full((rows, slots), -1), np.zeros((rows, slots))
         self.by_land = np.zeros((rows, slots, 2, size))
         self.L, self.a, self.step = np.zeros((rows, size, size)), np.zeros((rows, size)), np.zeros((rows, size))
-        self.first = np.zeros(rows, np.int64)
+        self.first, self.scale = np.zeros(rows, np.int64), np.ones(rows)  # scale of the noise in L
 
     def choose(self, use: np.ndarray, row: int) -> int:
         """Let the landmarks of the rows in use (M,) take part, theirs from row on; returns the row behind the last."""
@@ -213,6 +213,7 @@ class Solver:
         self.linearised_with, self._factor = damping, None
         for table, kind in ((p, kp), (q, kl)):
             table.taken[:table.count] = np.where(kind.use, np.arange(table.count), -1)
+            kind.scale[:table.count] = table.scale[:table.count]
         self.H[:] = w.prior_H
         add_link_hessians(*self._links, w.R0, w.p0, w.v0, w.b0, w.dt, w.dR, w.dp, w.dv, w.J_b, w.b_lin, w.W, w.w_b,
                           o.g_W, self._link_J, self.H)
@@ -367,13 +368,13 @@ class Solver:
         latest = regular(cholesky(H[:rows, :rows]))[-STATE:, -STATE:]
         return latest.T @ latest
 
-    def line_covariances(self, lines: np.ndarray, scale: F64) -> F64:
+    def line_covariances(self, lines: np.ndarray) -> F64:
         """(L, 4, 4) of lines (rows when Jacobians were taken last) in their tangent, as the newest camera knows them.
 
         A^-1 + (A^-1 W) C (A^-1 W)' with W the ties to rig and poses and C the covariance of these, given the newest
-        pose: where that pose is in the world is not the line's doubt, how the others stood to it is. Where the scale
-        (L,) of a line's noise is less than one, A^-1 is that of the given noise: from how its views scatter nobody
-        learns in what all of them are wrong.
+        pose: where that pose is in the world is not the line's doubt, how the others stood to it is. Where a line has
+        less noise than was given, A^-1 is that of the given noise: from how its views scatter nobody learns in what
+        all of them are wrong.
         """
         n, rows = self.window.n, self.window.rows
         H = self.H[:rows, :rows].copy()
@@ -385,5 +386,5 @@ class Solver:
         S = self._S[self.lines.first[lines, None] + np.arange(4), :len(seen)]
         inverse = np.linalg.inv(self.lines.L[lines]).transpose(0, 2, 1)
         AW = inverse @ S
-        own = inverse @ inverse.transpose(0, 2, 1) / np.minimum(scale, 1.0)[:, None, None]**2
+        own = inverse @ inverse.transpose(0, 2, 1) / np.minimum(self.lines.scale[lines], 1.0)[:, None, None]**2
         return own + AW @ C @ AW.transpose(0, 2, 1)
