@@ -65,6 +65,8 @@ def compile_all() -> None:
     compile_parts(parts)
     for process in others:
         process.join()
+    if any(process.exitcode for process in others):
+        sys.exit('a process that compiles kernels failed')
 
 
 def compile_parts(parts: int) -> None:

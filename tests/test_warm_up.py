@@ -78,6 +78,17 @@ def test_an_inner_kernel_is_compiled_once_whatever_constants_it_gets(decorate, v
     assert starts.count(scaled) == versions
 
 
+def test_a_process_that_fails_to_compile_its_parts_is_an_error():
+    code = """import os, sys
+from line_slam_ros import warm_up
+own = os.getpid()
+warm_up.os.sched_getaffinity, warm_up.warm_up_shared = lambda _: range(2), lambda: None
+warm_up.compile_parts = lambda parts: os.getpid() == own or sys.exit('not compiled')
+warm_up.compile_all()"""
+    done = run(code)
+    assert done.returncode != 0 and 'not compiled' in done.stderr
+
+
 @pytest.mark.parametrize('work', [compile_all, warm_up_estimator])
 def test_another_process_does_its_work_wherever_this_one_found_the_package(work):
     done = run(RUN.format(path=sys.path, work=work.__name__), PYTHONPATH='')

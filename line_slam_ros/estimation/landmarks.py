@@ -3,8 +3,8 @@
 All that a camera sees are the rig and the poses, so landmarks fill a system of their own over the columns [rig, pose
 of slot 0, pose of slot 1, ...]. For landmark i, of d numbers (3 for a point, 4 for a line), and slot f the buffers hold
 
-    chi2, weight (M, slots), pull (M, slots, 2)   squared whitened residual (-1: none, inf: behind the camera), its
-                                                  robust weight, their product
+    chi2, weight (M, slots), pull (M, slots, 2)   squared whitened residual (-1: none, inf: a point behind the
+                                                  camera), its robust weight, their product
     at, undo (M, slots)                           where in J its Jacobian is (-1: nowhere), 1 / sqrt(weight) then
     by_land (M, slots, 2, d)                      Jacobian by the landmark
     L (M, d, d), a (M, d)                         A = L L', the landmark's own Hessian, and its gradient
@@ -22,6 +22,7 @@ from line_slam_ros.factors.line_reprojection import line_reprojection, line_resi
 from line_slam_ros.factors.point_reprojection import inverse_depth_point, point_reprojection, point_residual
 from line_slam_ros.factors.robust import CAUCHY, robust
 from line_slam_ros.geometry.line_forms import move_line, world_line
+from line_slam_ros.geometry.small_systems import factor
 from line_slam_ros.kernel_cache import inner, kernel
 
 BEHIND = 100.0  # cost of a point behind its camera, squared standard deviations (a rejected step, not a gradient)
@@ -195,7 +196,7 @@ def eliminate(use, d, damping, L, first, columns, S):
         if not use[i]:
             continue
         row = first[i]
-        if not _factor(L[i], d, damping):
+        if not factor(L[i], d, damping):
             L[i] = 0.0
             S[row:row + d, :columns] = 0.0
             continue
@@ -207,24 +208,6 @@ def eliminate(use, d, damping, L, first, columns, S):
             x = 1.0 / L[i, j, j]
             for c in range(columns):
                 S[row + j, c] *= x
-
-
-@inner
-def _factor(A, d, damping):
-    """Lower triangle of A (d, d), its diagonal times 1 + damping -> L in place; False when not positive definite."""
-    for j in range(d):
-        t = A[j, j] * (1.0 + damping)
-        for k in range(j):
-            t -= A[j, k] * A[j, k]
-        if not t > 0.0:
-            return False
-        A[j, j] = np.sqrt(t)
-        for i in range(j + 1, d):
-            t = A[i, j]
-            for k in range(j):
-                t -= A[i, k] * A[j, k]
-            A[i, j] = t / A[j, j]
-    return True
 
 
 @kernel

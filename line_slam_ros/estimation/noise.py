@@ -3,8 +3,8 @@
 What the front end says of an observation is right to a factor only: images are blurred, dark or clean, patches lie on
 flat walls or across an edge. So the variance of a track is the given one times a factor, of which only the distribution
 is known: inverse gamma about the level of its kind, which makes its residuals together follow a multivariate t
-distribution. Factors and level take one step of expectation maximisation whenever the window was optimised
-in motion. Source: Lange, Little, Taylor, "Robust statistical modeling using the t distribution", 1989.
+distribution. Factors and level take one step of expectation maximisation whenever the window was optimised in motion.
+Source: Lange, Little, Taylor, "Robust statistical modeling using the t distribution", 1989.
 
 Nor are the errors of a track independent: as long as a patch looks the same it errs the same way. With correlation c
 of successive errors, as in a first order autoregressive process, m views say as much as m (1 - c) / (1 + c) independent

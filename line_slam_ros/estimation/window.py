@@ -12,6 +12,7 @@ from line_slam_ros.estimation.noise import Noise
 from line_slam_ros.geometry.imu import preintegrate
 from line_slam_ros.geometry.lie_kernels import log_so3, multiply_transposed
 from line_slam_ros.geometry.line_forms import VALUES
+from line_slam_ros.geometry.small_systems import factor
 from line_slam_ros.kernel_cache import kernel
 from line_slam_ros.types import F64, I64, ImuNoise, Samples
 
@@ -54,15 +55,11 @@ def rig_difference(R_BC, p_BC, delay, R_given, p_given, delta):
 
 @kernel
 def whiten(cov, W):
-    """W = L^-1 with L L' = cov, both (9, 9): W' W = cov^-1."""
-    L = np.empty((9, 9))
-    W[:] = 0.0
+    """W = L^-1 with L L' = cov, both (9, 9): W' W = cov^-1; NaN when cov is not positive."""
+    L = cov.copy()
     for i in range(9):
-        for j in range(i + 1):
-            t = cov[i, j]
-            for k in range(j):
-                t -= L[i, k] * L[j, k]
-            L[i, j] = np.sqrt(t + 1e-14) if i == j else t / L[j, j]
+        L[i, i] += 1e-14  # of a link without noise
+    W[:] = 0.0 if factor(L, 9, 0.0) else np.nan
     for j in range(9):
         W[j, j] = 1.0 / L[j, j]
         for i in range(j + 1, 9):

@@ -5,14 +5,33 @@ from line_slam_ros.kernel_cache import inner
 
 
 @inner
-def solve_positive(A, B, X):
-    """X = A^-1 B for a positive definite A (N, N), which is overwritten by its Cholesky factor."""
-    size = len(A)
-    for i in range(size):
-        for j in range(i + 1):
+def factor(A, size, damping):
+    """Lower triangle of A (size, size), its diagonal times 1 + damping -> Cholesky factor L, A = L L', in place.
+
+    False, and A is spoiled, when it is not positive definite.
+    """
+    for j in range(size):
+        t = A[j, j] * (1.0 + damping)
+        for k in range(j):
+            t -= A[j, k] * A[j, k]
+        if not t > 0.0:
+            return False
+        A[j, j] = np.sqrt(t)
+        for i in range(j + 1, size):
+            t = A[i, j]
             for k in range(j):
-                A[i, j] -= A[i, k] * A[j, k]
-            A[i, j] = np.sqrt(A[i, i]) if i == j else A[i, j] / A[j, j]
+                t -= A[i, k] * A[j, k]
+            A[i, j] = t / A[j, j]
+    return True
+
+
+@inner
+def solve_positive(A, B, X):
+    """X = A^-1 B for a positive definite A (N, N), which is overwritten by its Cholesky factor; else X is NaN."""
+    size = len(A)
+    if not factor(A, size, 0.0):
+        X[:] = np.nan
+        return
     for c in range(B.shape[1]):
         for i in range(size):
             X[i, c] = B[i, c]
