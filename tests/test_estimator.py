@@ -128,6 +128,21 @@ def test_blindness_longer_than_allowed_is_a_failure_that_says_so(moving):
     assert not any(failures) and aligned_error(moving, t, p) < 0.5
 
 
+def test_new_tracks_serve_at_once_when_nearly_all_corners_were_lost(moving):
+    """An image that is wrong nearly everywhere takes them; the few that are left must not put off a keyframe."""
+    steps = list(moving.steps())[85:94]
+    lasting = np.intersect1d(steps[0][0].points.ids, steps[-1][0].points.ids)[:12]
+    patient = Options(keyframe_parallax_px=200.0)
+    estimator, *_ = run(replace(moving, seconds=4.5), patient, lambda k, s: replace(s, lines=NO_LINES))
+    w = estimator.window
+    w.points.keep(np.isin(w.points.ids[:w.points.count], lasting))
+    for seen, samples in steps[5:]:
+        ids = np.where(np.isin(seen.points.ids, lasting), seen.points.ids, seen.points.ids + 10_000)
+        estimator.step(replace(seen, points=replace(seen.points, ids=ids), lines=NO_LINES), samples, still=False)
+        estimator.marginalise()
+    assert (w.points.solved & w.points.seen[:, w.n - 1])[:w.points.count].sum() > 50
+
+
 def test_covariance_grows_with_distance_and_bounds_the_error(moving):
     _, t, p, cov, _ = run(moving)
     sigma = np.sqrt(cov.sum(axis=1))

@@ -160,10 +160,11 @@ class Estimator:
         newest = self._predict(observations.t_ns, samples)
         w.still[newest] = still
         self._register(newest, observations)
+        just_followed = int((w.points.seen[:, newest - 1] & w.points.seen[:, newest])[:w.points.count].sum())
         if not self.newest_is_keyframe and not self._borders_rest(newest - 1):
             drop_state(self.solver, newest - 1)
         self._forget_ended()
-        self.newest_is_keyframe = self._is_keyframe()
+        self.newest_is_keyframe = self._is_keyframe(just_followed)
         self._followed = self._may_follow() and self._follower.follow(self.options.max_iterations)
         if not self._followed:
             self._optimise()
@@ -275,8 +276,11 @@ class Estimator:
             seen = table.seen[:table.count, :n]
             table.keep(seen[:, n - 1] | (seen.sum(axis=1) >= 2))
 
-    def _is_keyframe(self) -> bool:
-        """By mean parallax (rotation removed) against the previous keyframe, share of its tracks left, and time."""
+    def _is_keyframe(self, just_followed: int) -> bool:
+        """By mean parallax (rotation removed) against the previous keyframe, share of its tracks left, and time.
+
+        Also when nearly all corners followed from the last image, just_followed in number, are new to the window.
+        """
         w, n = self.window, self.window.n
         if n < 2:
             return True
@@ -286,6 +290,8 @@ class Estimator:
         if (w.t_ns[b] - w.t_ns[a]) * 1e-9 > self.options.keyframe_max_s:
             return True
         p, q = w.points, w.lines
+        if _followed(p, b, n) < min(just_followed, MIN_FOLLOWED):
+            return True
         both, had = p.seen[:p.count, a] & p.seen[:p.count, b], _followed(p, a, n)
         R = w.R_BC.T @ w.R[a].T @ w.R[b] @ w.R_BC
         shifts = corner_shifts(p.z[:p.count, a][both], _turned(R, p.z[:p.count, b][both]))
