@@ -129,8 +129,11 @@ class Bootstrap:
         rows = w.points.seen[:w.points.count, :w.n].sum(axis=1) >= MIN_VIEWS
         used = e.solver.points.chi2[:w.points.count, :w.n][rows]
         used = used[used >= 0.0]
-        if rows.sum() < MIN_MATCHES or np.median(used) > MAX_CHI2:
+        if rows.sum() < MIN_MATCHES:
             return f'corners that can be followed: {rows.sum()} in {MIN_VIEWS} views, {MIN_MATCHES} needed'
+        if (corners := float(np.median(used))) > MAX_CHI2:
+            return (f'agreement of motion and corners (squared residual {corners:.0f} per corner, {MAX_CHI2:.0f} '
+                    'allowed): keep moving')
         if np.linalg.norm(w.b[w.n - 1, 3:]) > 5.0 * self._options.accel_bias_sigma:
             return 'a plausible accelerometer bias: accelerate the camera in several directions'
         moved = w.p[w.n - 1] - w.p[0]
