@@ -17,7 +17,7 @@ from line_slam_ros.estimation.window import state_row
 from line_slam_ros.geometry.imu import between
 from line_slam_ros.geometry.lie import rigid, so3_exp, so3_log
 from line_slam_ros.simulation.features import GRAVITY_W, Room, Sequence, Trajectory, calibration
-from line_slam_ros.types import LINE_FORMS, LineObservations, PointObservations
+from line_slam_ros.types import LINE_FORMS, ImuNoise, LineObservations, PointObservations
 
 NO_LINES = LineObservations(np.empty(0, np.int64), np.empty((0, 2, 2)), np.empty((0, 2)))
 NO_POINTS = PointObservations(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2)))
@@ -94,6 +94,13 @@ def test_a_wrong_rig_is_refined():
     estimator, t, p, *_ = run(moving, off, stamped_early, given)
     np.testing.assert_array_equal(estimator.window.R_BC, given.T_BC[:3, :3])
     assert estimator.window.delay[0] == 0.0
+
+
+def test_biases_said_to_be_constant_leave_equations_that_can_be_solved(moving):
+    constant = replace(calibration(), imu_noise=ImuNoise(gyro_walk=1e-12, accel_walk=1e-12))
+    _, t, p, _, failures = run(moving, given=constant)
+    assert t[0] <= 3.0 and not any(failures)
+    assert aligned_error(moving, t, p) < 0.03
 
 
 def test_biases_are_found(moving):

@@ -18,6 +18,7 @@ from line_slam_ros.types import F64, I64, ImuNoise, Samples
 
 REST_S = 2.0  # longer at rest, the accelerometer only ties tilt and bias ever tighter: too stiff to solve, nothing new
 REST_SAMPLES = 1000  # inertial samples of a link between states at rest beyond which they are averaged
+LEAST_WALK = 1e-6  # rad/s^2, m/s^3 per root Hz: less changes nothing in an hour, but is too stiff to solve
 STATE = 15  # [rotation, position, velocity, gyro bias, accelerometer bias]
 POSE = 6  # the part of a state that a camera sees
 RIG = 7  # [rotation and position of the camera in the body, time offset]
@@ -229,8 +230,8 @@ class Window:
         whiten(self.cov[link], self.W[link])
         if self.dt[link] > REST_S and self.still[link] and self.still[link + 1]:
             self.W[link, 3:] = 0.0  # of lower triangular W, what is left whitens the rotation alone
-        self.w_b[link, :3] = 1.0 / (self.noise.gyro_walk * np.sqrt(self.dt[link]))
-        self.w_b[link, 3:] = 1.0 / (self.noise.accel_walk * np.sqrt(self.dt[link]))
+        self.w_b[link, :3] = 1.0 / (max(self.noise.gyro_walk, LEAST_WALK) * np.sqrt(self.dt[link]))
+        self.w_b[link, 3:] = 1.0 / (max(self.noise.accel_walk, LEAST_WALK) * np.sqrt(self.dt[link]))
 
     def freeze(self, slots: np.ndarray) -> None:
         """Fix the linearisation point of states the prior is about to know."""
