@@ -200,13 +200,15 @@ def test_a_start_reaches_the_right_scale_through_a_flat_valley():
     assert moved == pytest.approx(true, rel=0.05)
 
 
-def test_a_start_that_disagrees_with_corners_is_refused_and_says_so(moving):
+def test_a_start_that_disagrees_with_corners_or_inertial_data_is_refused_and_says_so(moving):
     estimator, *_ = run(replace(moving, seconds=1.05))
     bootstrap = Bootstrap(estimator, moving.calibration)
     assert bootstrap._refuse() == ''
     estimator.window.points.sigma /= 10.0
     estimator.solver.cost()
     assert 'agreement of motion and corners' in bootstrap._refuse()
+    estimator.window.W *= 20.0
+    assert 'calibrate the noise of the IMU' in bootstrap._refuse()
 
 
 def test_a_state_that_the_prior_knows_can_be_dropped(moving):

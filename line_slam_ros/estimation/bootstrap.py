@@ -124,8 +124,9 @@ class Bootstrap:
         e, w = self._estimator, self._estimator.window
         inertial = 2.0 * e.solver.inertial_cost() / (9 * (w.n - 1))
         if inertial > MAX_INERTIAL_CHI2:
-            return (f'agreement of motion and inertial data (squared residual {inertial:.0f} per measurement, '
-                    f'{MAX_INERTIAL_CHI2:.0f} allowed): keep moving')
+            return (f'agreement of motion and inertial data (squared residual {inertial:.1f} per measurement, '
+                    f'{MAX_INERTIAL_CHI2:.1f} allowed): keep moving; if it stays, calibrate the noise of the IMU and '
+                    'how the camera is turned against it')
         rows = w.points.seen[:w.points.count, :w.n].sum(axis=1) >= MIN_VIEWS
         used = e.solver.points.chi2[:w.points.count, :w.n][rows]
         used = used[used >= 0.0]
