@@ -19,6 +19,8 @@ _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
     'mono8': (1, 1, None), '8UC1': (1, 1, None), 'mono16': (2, 1, None),
     'rgb8': (1, 3, cv2.COLOR_RGB2GRAY), 'bgr8': (1, 3, cv2.COLOR_BGR2GRAY), '8UC3': (1, 3, cv2.COLOR_BGR2GRAY),
     'rgba8': (1, 4, cv2.COLOR_RGBA2GRAY), 'bgra8': (1, 4, cv2.COLOR_BGRA2GRAY),
+    'yuv422': (1, 2, cv2.COLOR_YUV2GRAY_UYVY), 'uyvy': (1, 2, cv2.COLOR_YUV2GRAY_UYVY),
+    'yuv422_yuy2': (1, 2, cv2.COLOR_YUV2GRAY_YUY2), 'yuyv': (1, 2, cv2.COLOR_YUV2GRAY_YUY2),
 }
 _CDR = 4  # bytes before a serialised message
 _CDR_HEADER = {order: struct.Struct(order + 'iII') for order in '<>'}

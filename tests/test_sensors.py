@@ -30,7 +30,8 @@ def padded(pixels: np.ndarray, padding: int) -> bytes:
 @pytest.mark.parametrize('padding', [0, 3])
 @pytest.mark.parametrize(('encoding', 'weights'), [
     ('mono8', [1.0]), ('8UC1', [1.0]), ('rgb8', [0.299, 0.587, 0.114]), ('bgr8', [0.114, 0.587, 0.299]),
-    ('rgba8', [0.299, 0.587, 0.114, 0.0]), ('bgra8', [0.114, 0.587, 0.299, 0.0])])
+    ('rgba8', [0.299, 0.587, 0.114, 0.0]), ('bgra8', [0.114, 0.587, 0.299, 0.0]),
+    ('yuv422', [0.0, 1.0]), ('uyvy', [0.0, 1.0]), ('yuv422_yuy2', [1.0, 0.0]), ('yuyv', [1.0, 0.0])])
 def test_every_8_bit_encoding_becomes_grey(new, encoding, weights, padding):
     pixels = colour_pixels(len(weights))
     step = WIDTH * len(weights) + padding
