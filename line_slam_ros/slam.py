@@ -10,14 +10,16 @@ import numpy as np
 from line_slam_ros.config import Config
 from line_slam_ros.estimation.bootstrap import Bootstrap
 from line_slam_ros.estimation.estimator import Estimator
-from line_slam_ros.estimation.stillness import Stillness
+from line_slam_ros.estimation.stillness import MAX_SHIFT_PX, Stillness
 from line_slam_ros.frontend.front_end import FrontEnd
 from line_slam_ros.geometry.camera import Camera
-from line_slam_ros.geometry.imu import between, longest_gap, turned
+from line_slam_ros.geometry.imu import between, joined, longest_gap, turned
+from line_slam_ros.geometry.lie import so3_log
 from line_slam_ros.mapping.line_map import LineMap
 from line_slam_ros.types import (
     F64,
     I64,
+    U8,
     Calibration,
     Estimate,
     Frame,
@@ -49,6 +51,8 @@ class Slam:
         self.status, self.waiting_for, self.resets = Status.INITIALISING, 'first image', 0
         self.timings: dict[str, float] = {}
         self._last_ns: int | None = None
+        self._last_image: U8 | None = None
+        self._kept: list[ImuBatch] = []  # of images left out since
         self._mapped = np.empty(0, np.int64)
 
     def warm_up(self, tell: Callable[[str], None] = print) -> None:
@@ -63,11 +67,16 @@ class Slam:
 
         When the caller is behind, nothing new is detected in this frame unless few tracks are left.
         Raises ValueError for a frame that is not newer than the last, that no inertial sample
-        accompanies, or whose size is not the camera's.
+        accompanies, whose size is not the camera's, or that repeats the last one.
         """
         self.timings = {}
         with self._timed('total'):
+            imu = joined([*self._kept, imu])
             samples = None if self._last_ns is None else between(imu, self._last_ns, frame.t_ns)
+            if samples is not None and self._repeats(frame, samples):
+                self._kept = [imu]
+                raise ValueError('the image is the last one again, though the camera turned: check the driver')
+            self._kept, self._last_image = [], frame.image
             with self._timed('track'):
                 observations = self.front_end.track(frame, self._camera_rotation(samples), skip_detection=behind)
             previous_ns, self._last_ns = self._last_ns, frame.t_ns
@@ -106,7 +115,7 @@ class Slam:
         self._forget()
         self._bootstrap.anchor = None
         self.line_map.clear()
-        self._last_ns = None
+        self._last_ns, self._kept = None, []
 
     def rig(self) -> RigCorrection:
         """How far the calibration of camera and IMU was refined."""
@@ -142,6 +151,18 @@ class Slam:
         self._bootstrap.clear()
         self._stillness.clear()
         self.front_end.reset()
+
+    def _repeats(self, frame: Frame, samples: Samples) -> bool:
+        """Whether the image is the last one to the bit although the body turned by more than a body at rest does.
+
+        An image without any contrast is none: a covered lens sees the same wherever it turns.
+        """
+        if (self.status is not Status.TRACKING or not np.array_equal(frame.image, self._last_image)
+                or frame.image.min() == frame.image.max()):
+            return False
+        t, gyro, _ = samples
+        angle = np.linalg.norm(so3_log(turned(t, gyro, self.estimator.gyro_bias())))
+        return bool(angle * self.camera.focal > MAX_SHIFT_PX)
 
     def _camera_rotation(self, samples: Samples | None) -> F64 | None:
         """R_CnCp by the gyro: turns rays of the previous camera into the newest."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from line_slam_ros.factors.imu_factor import imu_jacobians, imu_residual
-from line_slam_ros.geometry.imu import between, preintegrate, turned
+from line_slam_ros.geometry.imu import between, joined, preintegrate, turned
 from line_slam_ros.geometry.lie import so3_exp, so3_log
 from line_slam_ros.types import ImuBatch
 
@@ -233,6 +233,16 @@ def test_inertial_factor_jacobians_by_both_states(angle, bias_error, whitened):
 def batch(t_ns=(0, 10, 20, 30)):
     t_ns = np.array(t_ns, np.int64) * 1_000_000
     return ImuBatch(t_ns, np.outer(t_ns, [1e-9, 2e-9, 3e-9]), np.outer(t_ns, [4e-9, 5e-9, 6e-9]))
+
+
+def test_batches_that_overlap_join_to_the_whole():
+    whole = batch()
+    columns = whole.t_ns, whole.gyro_B, whole.accel_B
+    parts = [ImuBatch(*(c[part] for c in columns)) for part in (slice(2), slice(1, None))]
+    for made, given in ((joined(parts), whole), (joined([whole]), whole)):
+        np.testing.assert_array_equal(made.t_ns, given.t_ns)
+        np.testing.assert_array_equal(made.gyro_B, given.gyro_B)
+        np.testing.assert_array_equal(made.accel_B, given.accel_B)
 
 
 def test_samples_between_two_stamps_start_and_end_exactly_there_interpolated():

@@ -128,6 +128,25 @@ def test_frames_must_be_newer_than_the_last(slam, sequence):
         feed(slam, replace(sequence, seconds=0.2))
 
 
+def test_an_image_that_comes_again_while_turning_is_refused_and_its_inertial_data_count(slam, sequence):
+    found = {}
+    for k, (observations, imu) in enumerate(sequence):
+        image = BLACK.copy()
+        image[0, 100 if 100 <= k < 103 else k] = 255
+        slam.front_end.next = observations
+        frame = Frame(observations.t_ns, image)
+        if 100 < k < 103:
+            with pytest.raises(ValueError, match='the last one again'):
+                slam.process(frame, imu)
+        else:
+            found[k] = slam.process(frame, imu)
+    assert slam.resets == 0
+    t = np.array([100, 103]) / 20.0
+    true = np.diff(sequence.trajectory.at(t)[1], axis=0)
+    moved = found[103].T_WB[:3, 3] - found[100].T_WB[:3, 3]
+    assert np.linalg.norm(moved) == pytest.approx(np.linalg.norm(true), abs=0.005)
+
+
 def test_same_input_gives_the_same_numbers(sequence):
     def poses():
         slam = Slam(Config(points=PointOptions(max_count=600)), calibration())

@@ -144,6 +144,15 @@ def between(imu: ImuBatch, start_ns: int, end_ns: int) -> tuple[F64, F64, F64]:
     return t, np.ascontiguousarray(samples[:, :3]), np.ascontiguousarray(samples[:, 3:])
 
 
+def joined(batches: list[ImuBatch]) -> ImuBatch:
+    """Consecutive batches, which may overlap at their ends, as one."""
+    if len(batches) == 1:
+        return batches[0]
+    t_ns, first = np.unique(np.concatenate([b.t_ns for b in batches]), return_index=True)
+    return ImuBatch(t_ns, np.concatenate([b.gyro_B for b in batches])[first],
+                    np.concatenate([b.accel_B for b in batches])[first])
+
+
 def longest_gap(imu: ImuBatch, start_ns: int, end_ns: int) -> float:
     """Longest time (s) within [start_ns, end_ns] without a sample."""
     inside = imu.t_ns[(imu.t_ns > start_ns) & (imu.t_ns < end_ns)]
