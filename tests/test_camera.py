@@ -122,34 +122,35 @@ def test_centre_and_no_points_at_all(lens):
 def test_rectified_image_shows_each_pixel_where_the_pinhole_has_it(lens, scale):
     cam = camera(lens)
     v, u = np.mgrid[:480, :752].astype(np.float32)
-    rectification = cam.rectified(scale)
-    width, height = rectification.size
+    canvas = cam.canvas(scale)
+    width, height = canvas.size
     assert width <= 1.26 * 752 * scale and height <= 1.26 * 480 * scale
-    assert rectification.fx == pytest.approx(K[0] * scale)
-    uv = grid(rectification.size, 9).round()
-    seen = cam.project(rectification.normalise(uv))
+    assert canvas.fx == pytest.approx(K[0] * scale)
+    uv = grid(canvas.size, 9).round()
+    seen = cam.project(canvas.normalise(uv))
     inside = ((seen > 1) & (seen < (750, 478))).all(axis=1)
     assert inside.sum() > 20
     for axis, source in enumerate((u, v)):  # an image whose grey value is the coordinate itself
-        image = cv2.remap(source, rectification.map1, rectification.map2, cv2.INTER_LINEAR)
+        image = cv2.remap(source, *cam.maps(canvas), cv2.INTER_LINEAR)
         found = image[uv[:, 1].astype(int), uv[:, 0].astype(int)]
         np.testing.assert_allclose(found[inside], seen[inside, axis], atol=0.05)  # remap interpolates in 1/32 px
-    np.testing.assert_allclose(rectification.project(rectification.normalise(uv)), uv, atol=1e-10)
+    np.testing.assert_allclose(canvas.project(canvas.normalise(uv)), uv, atol=1e-10)
 
 
 def test_rectified_canvas_of_a_mild_lens_keeps_the_whole_field_of_view():
     cam = camera('pincushion')
-    rectification = cam.rectified()
-    corners = rectification.project(cam.normalise(grid(count=2)))
-    assert (corners >= -1).all() and (corners <= np.array(rectification.size) + 1).all()
+    canvas = cam.canvas()
+    corners = canvas.project(cam.normalise(grid(count=2)))
+    assert (corners >= -1).all() and (corners <= np.array(canvas.size) + 1).all()
 
 
 def test_undistorted_camera_is_its_own_rectification():
-    rectification = camera('no distortion').rectified()
-    assert rectification.size == (752, 480)
-    assert (rectification.fx, rectification.fy, rectification.cx, rectification.cy) == pytest.approx(K)
+    cam = camera('no distortion')
+    canvas = cam.canvas()
+    assert canvas.size == (752, 480)
+    assert (canvas.fx, canvas.fy, canvas.cx, canvas.cy) == pytest.approx(K)
     image = np.random.default_rng(0).integers(0, 256, (480, 752), dtype=np.uint8)
-    np.testing.assert_array_equal(cv2.remap(image, rectification.map1, rectification.map2, cv2.INTER_LINEAR), image)
+    np.testing.assert_array_equal(cv2.remap(image, *cam.maps(canvas), cv2.INTER_LINEAR), image)
 
 
 def test_focal_is_the_mean_of_both():

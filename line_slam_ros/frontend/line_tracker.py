@@ -57,8 +57,8 @@ class LineTracker:
 
     def __init__(self, camera: Camera, config: Lines):
         self._config = config
-        self.canvas, self._half_canvas = camera.rectified(), camera.rectified(0.5)
-        self._work = buffers(*self._half_canvas.size[::-1])
+        self.canvas, half_canvas = camera.canvas(), camera.canvas(0.5)
+        self._half_maps, self._work = camera.maps(half_canvas), buffers(*half_canvas.size[::-1])
         self._image = np.zeros((camera.calibration.height, camera.calibration.width), np.uint8)  # smoothed
         self._row = np.empty(camera.calibration.width + 4, np.uint16)
         self._view = self._image, self._lens_table(camera)  # what the kernels look at
@@ -143,7 +143,7 @@ class LineTracker:
         if self._wait > 0 or room == 0 or count > (FEW if wait else REFILL) * self._config.max_count:
             return False
         self._wait = DETECT_EVERY
-        half = cv2.remap(self._image, self._half_canvas.map1, self._half_canvas.map2, cv2.INTER_LINEAR)
+        half = cv2.remap(self._image, *self._half_maps, cv2.INTER_LINEAR)
         ends = 2.0 * detect(half, 0.5 * self._config.min_length_px, self._work)
         fresh = Segments.blank(len(ends))
         fresh.ends = ends

@@ -30,11 +30,9 @@ CONVERGED = 1e-8  # last Newton step, normalised units; what is left is about it
 
 
 @dataclass(frozen=True, slots=True)
-class Rectification:
-    """A pinhole image without distortion and how to make it: cv2.remap(image, map1, map2, cv2.INTER_LINEAR)."""
+class Canvas:
+    """A pinhole image without distortion."""
 
-    map1: NDArray[np.int16]  # (H, W, 2)
-    map2: NDArray[np.uint16]  # (H, W)
     fx: float  # px
     fy: float
     cx: float
@@ -42,11 +40,11 @@ class Rectification:
     size: tuple[int, int]  # W, H px
 
     def normalise(self, uv: F64) -> F64:
-        """Pixels (..., 2) of the rectified image to normalised coordinates (..., 2)."""
+        """Pixels (..., 2) of the canvas to normalised coordinates (..., 2)."""
         return (np.asarray(uv, float) - (self.cx, self.cy)) / (self.fx, self.fy)
 
     def project(self, x: F64) -> F64:
-        """Normalised coordinates (..., 2) to pixels (..., 2) of the rectified image."""
+        """Normalised coordinates (..., 2) to pixels (..., 2) of the canvas."""
         return np.asarray(x, float) * (self.fx, self.fy) + (self.cx, self.cy)
 
 
@@ -73,20 +71,24 @@ class Camera:
         """Normalised coordinates (N, 2) to pixels (N, 2); NaN outside the region where the model is one to one."""
         return self._lens.distort(np.asarray(x, float)) * self._focals + self._centre
 
-    def rectified(self, scale: float = 1.0) -> Rectification:
-        """The pinhole canvas with focal length * scale that keeps the field of view, up to WIDEST_CANVAS per side."""
+    def canvas(self, scale: float = 1.0) -> Canvas:
+        """The one with focal length * scale that keeps the field of view, up to WIDEST_CANVAS per side."""
         (left, top), (right, bottom) = (reach * scale for reach in self._reach())
         fx, fy = self._focals * scale
-        v, u = np.mgrid[: round(top + bottom) + 1, : round(left + right) + 1]
-        uv = self.project(np.stack([(u - left) / fx, (v - top) / fy], axis=-1).reshape(-1, 2))
+        return Canvas(float(fx), float(fy), float(left), float(top), (round(left + right) + 1, round(top + bottom) + 1))
+
+    def maps(self, canvas: Canvas) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+        """Two, of (H, W, 2) and (H, W), that make the canvas: cv2.remap(image, *maps, cv2.INTER_LINEAR)."""
+        width, height = canvas.size
+        v, u = np.mgrid[:height, :width]
+        uv = self.project(canvas.normalise(np.stack([u, v], axis=-1).reshape(-1, 2)))
         outside = -2.0  # px; far enough from the image that interpolation does not touch it
         limit = np.array([self.calibration.width, self.calibration.height]) + 1.0
-        uv = np.clip(np.nan_to_num(uv, nan=outside), outside, limit).astype(np.float32).reshape(*u.shape, 2)
-        map1, map2 = cv2.convertMaps(uv[..., 0], uv[..., 1], cv2.CV_16SC2)
-        return Rectification(map1, map2, float(fx), float(fy), float(left), float(top), (u.shape[1], u.shape[0]))
+        uv = np.clip(np.nan_to_num(uv, nan=outside), outside, limit).astype(np.float32).reshape(height, width, 2)
+        return cv2.convertMaps(uv[..., 0], uv[..., 1], cv2.CV_16SC2)
 
     def _reach(self) -> tuple[F64, F64]:
-        """Field of view in rectified px from the principal point: ([left, top], [right, bottom])."""
+        """Field of view in px of the canvas from the principal point: ([left, top], [right, bottom])."""
         width, height = self.calibration.width, self.calibration.height
         u, v = np.linspace(0.0, width - 1.0, 64), np.linspace(0.0, height - 1.0, 64)
 
