@@ -93,7 +93,7 @@ def warm_up_shared() -> None:
 
 def warm_up_estimator() -> None:
     """A few simulated seconds: start from motion, optimise, marginalise. To the kernels all options are but numbers."""
-    sequence = Sequence(Trajectory.random(1), Room.random(1, points=300, lines=60), calibration(), 4.0, frame_rate=10.0)
+    sequence = Sequence(Trajectory.random(1), Room.random(1, points=300, lines=60), calibration(), 2.5, frame_rate=10.0)
     estimator = Estimator(EstimatorOptions(), sequence.calibration, 450.0, 300, 60)
     for _ in drive(estimator, sequence.calibration, sequence.steps()):
         estimator.covariance()
