@@ -13,7 +13,7 @@ from line_slam_ros.geometry.lie_kernels import (
     right_jacobian,
     right_jacobian_inverse,
 )
-from line_slam_ros.kernel_cache import inner, kernel
+from line_slam_ros.kernel_cache import inner
 
 
 @inner
@@ -45,7 +45,7 @@ def _raw_residual(R_i, p_i, v_i, b_i, R_j, p_j, v_j, b_j, dt, dR, dp, dv, J_b, b
         r[9 + i] = b_j[i] - b_i[i]
 
 
-@kernel
+@inner
 def imu_residual(R_i, p_i, v_i, b_i, R_j, p_j, v_j, b_j, dt, dR, dp, dv, J_b, b_lin, W, w_b, g_W, r):
     """Fills the whitened residual r (15,) = [rotation, position, velocity, gyro bias, accel bias].
 
@@ -66,7 +66,7 @@ def imu_residual(R_i, p_i, v_i, b_i, R_j, p_j, v_j, b_j, dt, dR, dp, dv, J_b, b_
         r[9 + i] = w_b[i] * raw[9 + i]
 
 
-@kernel
+@inner
 def imu_jacobians(R_i, p_i, v_i, b_i, R_j, p_j, v_j, b_j, dt, dR, dp, dv, J_b, b_lin, W, w_b, g_W, J_i, J_j):
     """Fills J_i, J_j (15, 15): the whitened residual's derivatives by the two states."""
     E, rho, mu, raw = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(15)

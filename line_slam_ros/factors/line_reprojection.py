@@ -5,7 +5,7 @@ document with (15) corrected.
 """
 import numpy as np
 
-from line_slam_ros.kernel_cache import inner, kernel
+from line_slam_ros.kernel_cache import inner
 
 NO_IMAGE = 1e-18  # |n_C[:2]|^2 / |d|^2 at and below which a line runs through the optical centre along the axis
 
@@ -31,7 +31,7 @@ def _in_body_and_camera(R_WB, p_WB, R_BC, p_BC, n_W, d_W):
     return nb0, nb1, nb2, db0, db1, db2, nc0, nc1, nc2
 
 
-@kernel(forceinline=True)
+@inner(forceinline=True)
 def line_residual(R_WB, p_WB, R_BC, p_BC, n_W, d_W, ends, r):
     """line_reprojection without its Jacobians."""
     _, _, _, db0, db1, db2, nc0, nc1, nc2 = _in_body_and_camera(R_WB, p_WB, R_BC, p_BC, n_W, d_W)
@@ -44,7 +44,7 @@ def line_residual(R_WB, p_WB, R_BC, p_BC, n_W, d_W, ends, r):
     return True
 
 
-@kernel(forceinline=True)
+@inner(forceinline=True)
 def line_reprojection(R_WB, p_WB, R_BC, p_BC, n_W, d_W, ends, r, J_pose, J_ext, J_line):
     """Signed distances of the observed ends to the projected 3D line, normalised coordinates.
 

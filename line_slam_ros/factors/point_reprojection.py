@@ -1,5 +1,5 @@
 """A corner's reprojection residual and its Jacobians, compiled and allocation free."""
-from line_slam_ros.kernel_cache import inner, kernel
+from line_slam_ros.kernel_cache import inner
 
 MIN_DEPTH = 1e-3  # m: nearer, or behind, a point has no image
 
@@ -18,7 +18,7 @@ def _in_body_and_camera(R_WB, p_WB, R_BC, p_BC, p_W):
     return b0, b1, b2, c0, c1, c2
 
 
-@kernel(forceinline=True)
+@inner(forceinline=True)
 def point_residual(R_WB, p_WB, R_BC, p_BC, p_W, x, r):
     """point_reprojection without its Jacobians."""
     _, _, _, c0, c1, c2 = _in_body_and_camera(R_WB, p_WB, R_BC, p_BC, p_W)
@@ -28,7 +28,7 @@ def point_residual(R_WB, p_WB, R_BC, p_BC, p_W, x, r):
     return True
 
 
-@kernel(forceinline=True)
+@inner(forceinline=True)
 def point_reprojection(R_WB, p_WB, R_BC, p_BC, p_W, x, r, J_pose, J_ext, J_point):
     """Where a point projects minus where it was seen, normalised coordinates.
 
@@ -60,7 +60,7 @@ def point_reprojection(R_WB, p_WB, R_BC, p_BC, p_W, x, r, J_pose, J_ext, J_point
     return True
 
 
-@kernel
+@inner
 def inverse_depth_point(R_WA, p_WA, abr, p_W, J):
     """World point of anchored inverse depth coordinates (a, b, rho): p_W = R_WA (a, b, 1) / rho + p_WA.
 

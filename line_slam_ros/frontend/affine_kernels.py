@@ -91,7 +91,7 @@ def learn(image, uv, slots, templates, moments, inverses, ok):
             solve_positive(H, identity, inverses[slot])
 
 
-@kernel
+@inner
 def inside(shape, u, v, A):
     """Does a patch at (u, v) + A (x, y) lie in the image, and not too far apart?"""
     reach_u = RADIUS * (abs(A[0, 0]) + abs(A[0, 1]))
@@ -100,7 +100,7 @@ def inside(shape, u, v, A):
         and v + reach_v < shape[0] - 2.0 and reach_u < FARTHEST and reach_v < FARTHEST
 
 
-@kernel
+@inner
 def workspace():
     """Buffers of align(): the warped patch and what bend() needs, right-hand side, step."""
     return (np.empty(3 * AREA, np.float32), np.empty(AREA, np.int32), np.empty(2 * AREA, np.uint16),
@@ -179,7 +179,7 @@ def improve(uv, A, d):
     return True
 
 
-@kernel
+@inner
 def align(image, template, moments, inverse, uv, A, work):
     """Align a learned patch with the image by an affine warp: the guesses uv (2,) and A (2, 2) are improved in place.
 

@@ -31,7 +31,7 @@ BLUR = 1.4  # px, standard deviation of what an edge is seen through: optics abo
 ALONG = np.array([2.0 * (i + 0.5) / SAMPLES - 1.0 for i in range(SAMPLES)], np.float32)  # of the samples, -1 to 1
 
 
-@kernel
+@inner
 def workspace():
     """Buffers for one segment at a time: places, which of them are seen (a part of places), grey, correlations, peaks
     (offset, height, merit), rows of other numbers; indices and pairs of neighbours for sampling."""
@@ -53,7 +53,7 @@ def strip(view, ends, half, work):
     sample(image, places, half, work[2], index, work[7])
 
 
-@kernel(fastmath=True)
+@inner(fastmath=True)
 def normalise(values, seen, profile, rows):
     """Fill profile (WIDTH, SAMPLES) with the columns of values, zero mean and unit norm (0 where not seen).
 
@@ -139,7 +139,7 @@ def best_shift(table, usable, reach, tilt, total):
     return best + INERTIA * (abs(best_a) + 2 * abs(best_b)), best_a, best_b
 
 
-@kernel
+@inner
 def search(view, profile, ends, reach, tilt, work):
     """(mean correlation, a, b) where a profile fits best across predicted ends (2, 2); 0 if under half can be seen."""
     strip(view, ends, reach + tilt + HALF, work)
@@ -149,7 +149,7 @@ def search(view, profile, ends, reach, tilt, work):
     return best_shift(work[3], usable, reach, tilt, work[5][0])
 
 
-@kernel
+@inner
 def shift(ends, first, second):
     """Move the two ends (2, 2) along the segment's normal, in place."""
     du, dv = ends[1, 0] - ends[0, 0], ends[1, 1] - ends[0, 1]
@@ -187,7 +187,7 @@ def peaks(values, seen, first, reach, floor, found, block):
             found[2, i] = g * near if better else found[2, i]
 
 
-@kernel(fastmath=True)
+@inner(fastmath=True)
 def fit(found, scale, line):
     """Robust displacement a + b s of samples found (3, SAMPLES) with height > 0 (Cauchy weights of scale px).
 
@@ -221,7 +221,7 @@ def fit(found, scale, line):
     line[3] = variance * (w2 - w1 - w1 + w0) / determinant
 
 
-@kernel
+@inner
 def measure(view, floor, half, a, b, ends, work):
     """Put a segment (2, 2) on the edge itself, in place; (support, variances px^2 of its ends, height of the edge).
 
@@ -306,7 +306,7 @@ def displacement(values, seen, slopes):
     return worst
 
 
-@kernel
+@inner
 def remember(view, ends, profile, variance, work):
     """Fill profile (WIDTH, SAMPLES) of a segment (2, 2); add its displacement to the variance (2,) px^2 of its ends."""
     strip(view, ends, np.int64(HALF), work)

@@ -122,7 +122,7 @@ def prepare(patch, J, sums):
     sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7], sums[8] = g, u, v, gg, gu, gv, uu, uv, vv
 
 
-@kernel(fastmath=True)
+@inner(fastmath=True)
 def products(image, c, r, a, b, base, J):
     """Products of J (3, AREA) with the grey, less base, around (c + a, r + b), and the sum of that grey."""
     s0 = s1 = s2 = total = np.float32(0.0)

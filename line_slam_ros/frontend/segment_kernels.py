@@ -27,7 +27,7 @@ def buffers(height, width):
             np.empty(height * width, np.int32))
 
 
-@kernel(fastmath=True)
+@inner(fastmath=True)
 def gradients(image, strength, angle):
     """Fill strength (H, W), grey/px, and angle (H, W), 1/256 turns but 1 for 0, at (x + 0.5, y + 0.5); 0 where flat.
 
@@ -116,7 +116,7 @@ def grow(x, y, angle, region):
     return n, (np.float32(seed) + mean) / TURN
 
 
-@kernel
+@inner
 def straight(region, strength, direction, ends):
     """Fill ends (2, 2) px of the axis of region (N,), the brighter side (direction, rad) along its normal."""
     w = u = v = uu = uv = vv = 0.0

@@ -99,7 +99,7 @@ def twin(pluecker, cov, ends, others, other_cov, other_ends, rows, gone, nearnes
     return best, nearest
 
 
-@kernel
+@inner
 def within(low, high, reach, ends, rows):
     """How many of the segments (L, 2, 3) have boxes nearer than reach to the one from low to high (3,), along every
     axis; fills rows with them."""
@@ -173,7 +173,7 @@ def _share_beside(d, short, long):
     return (min(end, last) - max(begin, first)) / max(end - begin, ROUNDING)
 
 
-@kernel
+@inner
 def fuse(a, a_cov, a_ends, b, b_cov, b_ends, pluecker, cov, ends):
     """The information-weighted mean of two estimates of one line, over the union of their extents.
 
