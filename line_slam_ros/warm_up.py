@@ -21,7 +21,6 @@ from line_slam_ros.estimation.estimator import Estimator
 from line_slam_ros.frontend.front_end import FrontEnd
 from line_slam_ros.geometry.camera import Camera, warm_up_lenses
 from line_slam_ros.geometry.imu import turned
-from line_slam_ros.geometry.lie import quaternion_from_matrix
 from line_slam_ros.geometry.lie_kernels import retract_rotation
 from line_slam_ros.kernel_cache import cache_is_empty, fill
 from line_slam_ros.mapping.fusion import worst_sigma
@@ -86,7 +85,6 @@ def elsewhere(work: Callable[[], None]) -> subprocess.Popen:
 def warm_up_shared() -> None:
     """What several parts need."""
     warm_up_lenses()
-    quaternion_from_matrix(np.eye(3))
     turned(np.array([0.0, 0.1]), np.zeros((2, 3)), np.zeros(3))
     retract_rotation(np.eye(3), np.zeros(3), np.eye(3))
 

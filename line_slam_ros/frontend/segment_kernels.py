@@ -16,7 +16,6 @@ TURN = np.float32(256.0 / (2.0 * np.pi))  # 1/256 turns per rad
 STRONGEST = 255
 
 
-@kernel
 def buffers(height, width):
     """Work space of segments() for images of this size: strength, angle, crests; places in order, of a region.
 

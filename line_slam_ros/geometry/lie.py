@@ -12,10 +12,11 @@ Formulas: Sola, Deray, Atchuthan, "A micro Lie theory for state estimation in ro
 """
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from line_slam_ros.kernel_cache import kernel
 from line_slam_ros.types import F64
 
 
@@ -76,34 +77,24 @@ def quaternion_from_matrix(R: ArrayLike) -> F64:
     The matrix gives all products 4 q_i q_j; the column of the largest square is q up to scale (Shepperd, 1978).
     """
     R = np.asarray(R, float)
-    q_xyzw = np.empty((*R.shape[:-2], 4))
-    _quaternions(np.ascontiguousarray(R).reshape(-1, 3, 3), q_xyzw.reshape(-1, 4))
-    return q_xyzw
+    return np.array([_quaternion(one) for one in R.reshape(-1, 3, 3).tolist()]).reshape(*R.shape[:-2], 4)
 
 
-@kernel
-def _quaternions(R, q_xyzw):
-    """Fills q_xyzw (N, 4) from R (N, 3, 3)."""
-    column = np.empty(4)
-    for i in range(len(R)):
-        trace = R[i, 0, 0] + R[i, 1, 1] + R[i, 2, 2]
-        largest, square = 3, 1.0 + trace
-        for k in range(2, -1, -1):
-            if 2.0 * R[i, k, k] + (1.0 - trace) >= square:
-                largest, square = k, 2.0 * R[i, k, k] + (1.0 - trace)
-        for k in range(3):
-            skew = R[i, (k + 2) % 3, (k + 1) % 3] - R[i, (k + 1) % 3, (k + 2) % 3]
-            if largest == 3:
-                column[k] = skew
-            else:
-                column[k] = square if k == largest else R[i, k, largest] + R[i, largest, k]
-                if k == largest:
-                    column[3] = skew
-        if largest == 3:
-            column[3] = square
-        norm = np.sqrt(column[0] ** 2 + column[1] ** 2 + column[2] ** 2 + column[3] ** 2)
-        for k in range(4):
-            q_xyzw[i, k] = (-column[k] if column[3] < 0.0 else column[k]) / norm
+def _quaternion(R: list[list[float]]) -> list[float]:
+    """Of one matrix. On numbers: arrays as small as this take NumPy longer."""
+    trace = R[0][0] + R[1][1] + R[2][2]
+    largest, square = 3, 1.0 + trace
+    for k in range(2, -1, -1):
+        if 2.0 * R[k][k] + (1.0 - trace) >= square:
+            largest, square = k, 2.0 * R[k][k] + (1.0 - trace)
+    skew = [R[2][1] - R[1][2], R[0][2] - R[2][0], R[1][0] - R[0][1]]
+    if largest == 3:
+        x, y, z, w = *skew, square
+    else:
+        x, y, z = (square if k == largest else R[k][largest] + R[largest][k] for k in range(3))
+        w = skew[largest]
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    return [(-c if w < 0.0 else c) / norm for c in (x, y, z, w)]
 
 
 def rigid(R_AB: ArrayLike, p_AB: ArrayLike) -> F64:
