@@ -40,8 +40,15 @@ def point_reprojection(R_WB, p_WB, R_BC, p_BC, p_W, x, r, J_pose, J_ext, J_point
     Returns False, filling nothing, for a point that is not in front of the camera (z <= MIN_DEPTH).
     """
     b0, b1, b2, c0, c1, c2 = _in_body_and_camera(R_WB, p_WB, R_BC, p_BC, p_W)
-    if not c2 > MIN_DEPTH:
-        return False
+    in_front = c2 > MIN_DEPTH
+    if in_front:
+        _fill(R_WB, R_BC, b0, b1, b2, c0, c1, c2, x, r, J_pose, J_ext, J_point)
+    return in_front
+
+
+@inner(forceinline=True)
+def _fill(R_WB, R_BC, b0, b1, b2, c0, c1, c2, x, r, J_pose, J_ext, J_point):
+    """point_reprojection of what is at b in the body, c in the camera. Without branches, so arrays need no counting."""
     iz = 1.0 / c2
     u, v = c0 * iz, c1 * iz
     r[0], r[1] = u - x[0], v - x[1]
@@ -57,7 +64,6 @@ def point_reprojection(R_WB, p_WB, R_BC, p_BC, p_W, x, r, J_pose, J_ext, J_point
         for j in range(3):
             J_point[k, j] = a0 * R_WB[j, 0] + a1 * R_WB[j, 1] + a2 * R_WB[j, 2]
             J_pose[k, 3 + j] = -J_point[k, j]
-    return True
 
 
 @inner
