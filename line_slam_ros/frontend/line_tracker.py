@@ -80,7 +80,8 @@ class LineTracker:
 
     def forget(self, ids: I64) -> None:
         """End these tracks."""
-        self.segments = self.segments.select(~np.isin(self.segments.ids, ids))
+        if len(ids):
+            self.segments = self.segments.select(~np.isin(self.segments.ids, ids))
 
     def observations(self) -> LineObservations:
         """The segments in the newest image."""

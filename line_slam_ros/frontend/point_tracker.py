@@ -83,7 +83,8 @@ class PointTracker:
 
     def forget(self, ids: I64) -> None:
         """End these tracks."""
-        self.corners = self.corners.select(~np.isin(self.corners.ids, ids))
+        if len(ids):
+            self.corners = self.corners.select(~np.isin(self.corners.ids, ids))
 
     def observations(self) -> PointObservations:
         """The corners in the newest image."""
