@@ -42,7 +42,7 @@ def _into_prior(solver: Solver, slot: int, points: np.ndarray, lines: np.ndarray
     window = solver.window
     solver.linearise(points, lines, links=links)
     gone = np.arange(state_row(slot), state_row(slot + 1))
-    kept = np.setdiff1d(np.arange(window.rows), gone)
+    kept = np.delete(np.arange(window.rows), gone)
     reduced_H, reduced_g = eliminate(solver.H, solver.g, gone, kept)
     touched = kept[np.any(reduced_H != 0.0, axis=1)]
     window.freeze(np.unique((touched[touched >= RIG] - RIG) // STATE))

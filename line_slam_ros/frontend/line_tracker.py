@@ -157,7 +157,7 @@ class LineTracker:
         both = self._apart(self.segments.extended(fresh), old + len(fresh))
         fresh = both.select(slice(old, self._config.max_count))
         fresh.ids = np.arange(self._next_id, self._next_id + len(fresh))
-        fresh.slots = np.setdiff1d(np.arange(self._config.max_count), self.segments.slots)[:len(fresh)]
+        fresh.slots = np.delete(np.arange(self._config.max_count), self.segments.slots)[:len(fresh)]
         self._next_id += len(fresh)
         edge.learn(self._view, fresh.ends, fresh.slots, self._profiles, fresh.variance)
         self.segments = self.segments.extended(fresh)

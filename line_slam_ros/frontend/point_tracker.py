@@ -129,7 +129,7 @@ class PointTracker:
                          self._config.min_distance_px, cell, self._config.min_contrast)
         fresh = Corners.blank(len(uv))
         fresh.uv, fresh.x, good = uv, self._camera.normalise(uv), np.ones(len(uv), np.bool_)
-        fresh.slots = np.setdiff1d(np.arange(count), self.corners.slots)[:len(uv)]
+        fresh.slots = np.delete(np.arange(count), self.corners.slots)[:len(uv)]
         learn(image, uv, fresh.slots, *self._learned, good)
         fresh = fresh.select(good & self._inside(uv) & np.isfinite(fresh.x).all(axis=1))
         fresh.ids = np.arange(self._next_id, self._next_id + len(fresh))
