@@ -32,7 +32,7 @@ from line_slam_ros.geometry.lie_kernels import retract_rotation
 from line_slam_ros.kernel_cache import kernel
 from line_slam_ros.types import F64, LineForm
 
-TRUSTED = 0.5  # of the predicted change of the cost: a smaller error, and the Jacobians serve for another step
+TRUSTED = 0.8  # of the predicted change of the cost: a smaller error, and the Jacobians serve for another step
 LEAST_DAMPING = 1e-9  # too small to matter
 CONVERGED = 0.3  # change of the cost (half squared standard deviations) below which iterating ends: of some 200 numbers
 # together, a twentieth of a standard deviation each
