@@ -9,7 +9,7 @@ import pytest
 from line_slam_ros.benchmark.consistency import World, simulate
 from line_slam_ros.config import Estimator as Options
 from line_slam_ros.estimation import solver as solver_module
-from line_slam_ros.estimation.bootstrap import MAX_UNSETTLED, drive
+from line_slam_ros.estimation.bootstrap import MAX_UNSETTLED, Bootstrap, drive
 from line_slam_ros.estimation.estimator import Estimator
 from line_slam_ros.estimation.initialisation import upright
 from line_slam_ros.estimation.marginalisation import drop_state, eliminate

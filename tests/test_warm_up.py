@@ -34,9 +34,10 @@ image = np.kron(rng.integers(0, 255, (16, 20)), np.ones((30, 32))).astype(np.uin
 for lens in (calibration(), replace(calibration(), model='equidistant')):
     slam = Slam(Config(), lens)
     for seen, imu in Sequence(Trajectory.random(1), Room.random(1), lens, 4.0):
-        slam.front_end.track(Frame(seen.t_ns, np.roll(image, seen.t_ns // 50_000_000, 1)), np.eye(3))
+        frame = Frame(seen.t_ns, np.roll(image, seen.t_ns // 50_000_000, 1))
+        slam.front_end.track(frame, np.eye(3))
         track, slam.front_end.track = slam.front_end.track, lambda *_, now=seen, **__: now
-        slam.process(Frame(seen.t_ns, image), imu)
+        slam.process(frame, imu)
         slam.front_end.track = track
 print('left:', *(signatures() - before))
 print('versions:', *(len(kernel.signatures) for kernel in (point_jacobians, line_jacobians, eliminate)))

@@ -19,6 +19,7 @@ from line_slam_ros.types import F64, I64, Calibration, LineForm, Observations, R
 
 MAX_GYRO_BIAS, MAX_ACCEL_BIAS, MAX_SPEED = 0.5, 2.5, 50.0  # rad/s, m/s^2, m/s: beyond, the estimate is nonsense
 MIN_FOLLOWED = 20  # known landmarks that a state must see to be estimated against them alone
+FEW_KNOWN = 0.25  # share of the corners just followed below which the window lost touch
 MIN_FEATURES = 6  # fewer that an earlier state saw, too, and the camera is blind
 
 
@@ -279,7 +280,7 @@ class Estimator:
     def _is_keyframe(self, just_followed: int) -> bool:
         """By mean parallax (rotation removed) against the previous keyframe, share of its tracks left, and time.
 
-        Also when nearly all corners followed from the last image, just_followed in number, are new to the window.
+        Also when most of the corners followed from the last image, just_followed in number, are new to the window.
         """
         w, n = self.window, self.window.n
         if n < 2:
@@ -290,7 +291,7 @@ class Estimator:
         if (w.t_ns[b] - w.t_ns[a]) * 1e-9 > self.options.keyframe_max_s:
             return True
         p, q = w.points, w.lines
-        if _followed(p, b, n) < min(just_followed, MIN_FOLLOWED):
+        if _followed(p, b, n) < FEW_KNOWN * just_followed:
             return True
         both, had = p.seen[:p.count, a] & p.seen[:p.count, b], _followed(p, a, n)
         R = w.R_BC.T @ w.R[a].T @ w.R[b] @ w.R_BC
