@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 
 from line_slam_ros.config import Estimator as Options
+from line_slam_ros.estimation import neighbours
 from line_slam_ros.estimation.bootstrap import drive
 from line_slam_ros.estimation.estimator import Estimator
 from line_slam_ros.estimation.noise import LEVELS, MOST_CORRELATED, VIEWS, Noise
@@ -73,6 +74,12 @@ def test_neither_perfect_nor_wild_residuals_are_believed_without_bound():
     perfect, _ = learnt(np.zeros((100, 10, 2)), 200)
     wild, _ = learnt(100.0 * residuals(np.random.default_rng(4), 100, 10, 0.95), 200)
     assert perfect.level == LEVELS[0] and wild.level == LEVELS[1] and wild.correlation == MOST_CORRELATED
+
+
+@pytest.fixture(autouse=True)
+def single_images(monkeypatch):
+    """Observations as they were simulated: no means over the frames around a keyframe."""
+    monkeypatch.setattr(neighbours, 'REACH_S', 0.0)
 
 
 def run(pixel_sigma, seconds=6.0, rest=0.0, told=0.3):

@@ -9,6 +9,7 @@ from line_slam_ros.config import Estimator as Options
 from line_slam_ros.estimation.following import Follower
 from line_slam_ros.estimation.initialisation import Snapshot, Start
 from line_slam_ros.estimation.marginalisation import drop_state, marginalise_oldest
+from line_slam_ros.estimation.neighbours import Neighbours
 from line_slam_ros.estimation.shift import FEW_CORNERS, corner_shifts, segment_shifts
 from line_slam_ros.estimation.solver import CONVERGED, LEAST_DAMPING, Solver, SolverOptions
 from line_slam_ros.estimation.triangulation import lines_in_cameras, start_lines, start_points
@@ -53,7 +54,7 @@ class Estimator:
             self.g_W, options.loss_scale**2, options.loss_scale**2,
             LineForm.of(options.line_representation)))
         self.newest_is_keyframe, self._followed = True, False
-        self._follower = Follower(self.solver)
+        self._follower, self._neighbours = Follower(self.solver), Neighbours(self.solver, options.gate_chi2)
         self.failure = ''
         self._last_sight_ns = 0
         self._marginalised = False  # until then the prior is only the gauge, and nothing is bound to first estimates
@@ -65,6 +66,7 @@ class Estimator:
         w = self.window
         w.clear()
         self._follower.clear()
+        self._neighbours.clear()
         bias = np.concatenate([start.gyro_bias, np.zeros(3)])
         for k, shot in enumerate(shots):
             w.append(shot.t_ns, start.R_WB[k], start.p_W[k], start.v_W[k], bias, shot.samples)
@@ -175,6 +177,7 @@ class Estimator:
             for table, kind in kinds:
                 table.learn_noise(w.n, kind.pull, kind.weight, kind.size)
         outliers = self._cull(*wrong)
+        self._neighbours.add(observations, self.newest_is_keyframe)
         self.failure = self._health()
         return outliers
 

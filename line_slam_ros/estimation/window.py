@@ -88,33 +88,37 @@ class LandmarkTable:
         self.seen = np.zeros((rows, slots), np.bool_)
         self.z = np.zeros((rows, slots, *observation))  # normalised image coordinates
         self.sigma = np.ones((rows, slots, 2))  # their standard deviation: as given, times the scale of the track
+        self.images = np.ones((rows, slots), np.int64)  # over which an observation is a mean: neighbours.py
         self.scale, self.noise = np.ones(rows), Noise()  # of each track's errors, and what is known of all: noise.py
         self.solved = np.zeros(rows, np.bool_)  # has a 3D estimate and takes part in the optimisation
         self.views = np.zeros(rows, np.int64)  # keyframes that ever saw it, also those that left the window
         self.taken = np.full(rows, -1, np.int64)  # its row when Jacobians were taken last; -1: not there
         # L (rows, d, d), a field of both: L L' is its Hessian, given the poses, at the last anchor (following.py)
-        self._columns = ['ids', 'seen', 'z', 'sigma', 'solved', 'views', 'taken', 'scale', *fields]
+        self._columns = ['ids', 'seen', 'z', 'sigma', 'images', 'solved', 'views', 'taken', 'scale', *fields]
         for name, shape in fields.items():
             setattr(self, name, np.zeros((rows, *shape)))
 
     def observe(self, slot: int, ids: I64, z: F64, sigma: F64) -> None:
         """Write one frame's observations (N, ...) into a slot; unknown ids get new rows while there is room."""
-        known = self.ids[:self.count]
-        order = np.argsort(known, kind='stable')
-        at = np.searchsorted(known, ids, sorter=order)
-        at_clipped = np.minimum(at, max(self.count - 1, 0))
-        rows = order[at_clipped] if self.count else np.zeros(len(ids), np.int64)
-        new = known[rows] != ids if self.count else np.ones(len(ids), np.bool_)
+        rows = self.find(ids)
         room = len(self.ids) - self.count
-        fresh = np.flatnonzero(new)[:room]
-        rows = np.where(new, -1, rows)
+        fresh = np.flatnonzero(rows < 0)[:room]
         rows[fresh] = self.count + np.arange(len(fresh))
         self._clear_rows(self.count, self.count + len(fresh))
         self.ids[rows[fresh]] = ids[fresh]
         self.count += len(fresh)
         used = rows >= 0
         self.seen[rows[used], slot], self.z[rows[used], slot] = True, z[used]
-        self.sigma[rows[used], slot] = sigma[used] * self.scale[rows[used], None]
+        self.sigma[rows[used], slot], self.images[rows[used], slot] = sigma[used] * self.scale[rows[used], None], 1
+
+    def find(self, ids: I64) -> I64:
+        """Rows (N,) of ids, -1 where unknown."""
+        if not self.count:
+            return np.full(len(ids), -1)
+        order = np.argsort(self.ids[:self.count], kind='stable')
+        at = np.searchsorted(self.ids[:self.count], ids, sorter=order)
+        rows = order[np.minimum(at, self.count - 1)]
+        return np.where(self.ids[rows] == ids, rows, -1)
 
     def _clear_rows(self, first: int, last: int) -> None:
         self.seen[first:last], self.solved[first:last] = False, False
@@ -136,7 +140,7 @@ class LandmarkTable:
 
     def remove_slot(self, slot: int, slots: int) -> None:
         """Forget what a slot saw and close the gap; slots = number of slots in use before."""
-        for a in (self.seen, self.z, self.sigma):
+        for a in (self.seen, self.z, self.sigma, self.images):
             a[:self.count, slot:slots - 1] = a[:self.count, slot + 1:slots]
         self.seen[:self.count, slots - 1] = False
 
