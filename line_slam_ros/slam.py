@@ -10,7 +10,7 @@ import numpy as np
 from line_slam_ros.config import Config
 from line_slam_ros.estimation.bootstrap import Bootstrap
 from line_slam_ros.estimation.estimator import Estimator
-from line_slam_ros.estimation.stillness import MAX_SHIFT_PX, Stillness
+from line_slam_ros.estimation.stillness import MAX_GYRO_STD, Stillness
 from line_slam_ros.frontend.front_end import FrontEnd
 from line_slam_ros.geometry.camera import Camera
 from line_slam_ros.geometry.imu import between, joined, longest_gap, turned
@@ -153,7 +153,7 @@ class Slam:
         self.front_end.reset()
 
     def _repeats(self, frame: Frame, samples: Samples) -> bool:
-        """Whether the image is the last one to the bit although the body turned by more than a body at rest does.
+        """Whether the image is the last one to the bit although the body turned faster than a body at rest may.
 
         An image without any contrast is none: a covered lens sees the same wherever it turns.
         """
@@ -162,7 +162,7 @@ class Slam:
             return False
         t, gyro, _ = samples
         angle = np.linalg.norm(so3_log(turned(t, gyro, self.estimator.gyro_bias())))
-        return bool(angle * self.camera.focal > MAX_SHIFT_PX)
+        return bool(angle > MAX_GYRO_STD * t[-1])
 
     def _camera_rotation(self, samples: Samples | None) -> F64 | None:
         """R_CnCp by the gyro: turns rays of the previous camera into the newest."""

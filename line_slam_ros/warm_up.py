@@ -65,7 +65,7 @@ def compile_all() -> None:
     for process in others:
         process.join()
     if any(process.exitcode for process in others):
-        sys.exit('a process that compiles kernels failed')
+        raise RuntimeError('a process that compiles kernels failed, see above')
 
 
 def compile_parts(parts: int) -> None:
