@@ -33,6 +33,7 @@ from line_slam_ros.types import (
 from line_slam_ros.warm_up import warm_up
 
 MAX_IMU_GAP_S = 0.2  # longer, and the motion in between is anyone's guess
+MAX_REPEATED_S = 1.0  # longer with one and the same image while the camera turns, and the estimate is lost
 
 
 class Slam:
@@ -67,18 +68,22 @@ class Slam:
 
         When the caller is behind, nothing new is detected in this frame unless few tracks are left.
         Raises ValueError for a frame that is not newer than the last, that no inertial sample
-        accompanies, whose size is not the camera's, or that repeats the last one.
+        accompanies, whose size is not the camera's, or that repeats the last one while the camera turns
+        and is tracked; when that lasts, the estimate is lost.
         """
         self.timings = {}
         with self._timed('total'):
             imu = joined([*self._kept, imu])
             samples = None if self._last_ns is None else between(imu, self._last_ns, frame.t_ns)
             if samples is not None and self._repeats(frame, samples):
-                self._kept = [imu]
-                raise ValueError('the image is the last one again, though the camera turned: check the driver')
-            self._kept, self._last_image = [], frame.image
+                if samples[0][-1] < MAX_REPEATED_S:
+                    self._kept = [imu]
+                    raise ValueError('the image is the last one again, though the camera turned: check the driver')
+                self._last_ns, self._kept = frame.t_ns, []
+                return self._lose(f'the same image for {samples[0][-1]:.1f} s, though the camera turned')
             with self._timed('track'):
                 observations = self.front_end.track(frame, self._camera_rotation(samples), skip_detection=behind)
+            self._kept, self._last_image = [], frame.image
             previous_ns, self._last_ns = self._last_ns, frame.t_ns
             still = self._stillness.add(observations, samples)
             if samples is not None and (gap := longest_gap(imu, previous_ns, frame.t_ns)) > MAX_IMU_GAP_S:

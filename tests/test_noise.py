@@ -165,6 +165,6 @@ def test_what_is_more_exact_than_it_was_said_to_be_may_still_err():
         table.seen[row, n - 1] = True
         estimator.solver.points.chi2[row, n - 1] = (error * given / table.sigma[row, n - 1, 0])**2
         outlier = table.ids[row]
-        wrong = estimator._contradicted(table, estimator.solver.points.chi2)
+        wrong = estimator._reject(table, estimator.solver.points.chi2)
         gone, _ = estimator._cull(wrong, np.zeros((estimator.window.lines.count, n), np.bool_))
         assert (outlier not in gone) == stays

@@ -1,5 +1,6 @@
 """Slam as the shells see it, with a front end that hands out simulated observations instead of looking at images."""
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -138,13 +139,35 @@ def test_an_image_that_comes_again_while_turning_is_refused_and_its_inertial_dat
         if 100 < k < 103:
             with pytest.raises(ValueError, match='the last one again'):
                 slam.process(frame, imu)
-        else:
+            continue
+        with mock.patch.object(slam.estimator, 'step', wraps=slam.estimator.step) as step:
             found[k] = slam.process(frame, imu)
+        if k == 103:
+            t, gyro, _ = step.call_args.args[1]
+            expected = sequence.trajectory.at(np.arange(100, 103.05, 0.1) / 20.0)[3] + sequence.gyro_bias
+            assert len(t) == len(expected) == 31
+            np.testing.assert_allclose(gyro, expected, atol=0.02)
     assert slam.resets == 0
     t = np.array([100, 103]) / 20.0
     true = np.diff(sequence.trajectory.at(t)[1], axis=0)
     moved = found[103].T_WB[:3, 3] - found[100].T_WB[:3, 3]
     assert np.linalg.norm(moved) == pytest.approx(np.linalg.norm(true), abs=0.005)
+
+
+def test_a_camera_that_goes_on_showing_one_image_while_it_turns_is_lost(slam, sequence):
+    for k, (observations, imu) in enumerate(sequence):
+        image = BLACK.copy()
+        image[0, min(k, 100)] = 255
+        slam.front_end.next = observations
+        if k <= 100:
+            slam.process(Frame(observations.t_ns, image), imu)
+        elif slam.status is Status.TRACKING and k < 120:
+            with pytest.raises(ValueError, match='the last one again'):
+                slam.process(Frame(observations.t_ns, image), imu)
+        else:
+            slam.process(Frame(observations.t_ns, image), imu)
+            break
+    assert k == 120 and slam.status is Status.LOST and 'the same image for 1.0 s' in slam.waiting_for
 
 
 def test_same_input_gives_the_same_numbers(sequence):

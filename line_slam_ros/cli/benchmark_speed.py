@@ -50,7 +50,11 @@ def profile(recording: Recording, threads: int) -> Profile:
         slam.warm_up()
         with Results(Path(scratch), source.shell, {}, slam, inbox, with_figure=False) as results:
             for frame, imu in _pairs(source, inbox, watch):
-                estimate = slam.process(frame, imu)
+                try:
+                    estimate = slam.process(frame, imu)
+                except ValueError as error:  # as in a replay
+                    inbox.reject('image not usable', str(error), frame.t_ns)
+                    continue
                 for stage, cost in slam.costs().items():
                     watch.add(stage, cost)
                 with watch.stage('publish'):
@@ -145,7 +149,10 @@ def memory(recording: Recording, motion: Motion, minutes: float) -> Memory:
                 break
             source.put(inbox, shown, images)
             while (pair := inbox.take()) is not None:
-                slam.process(*pair)
+                try:
+                    slam.process(*pair)
+                except ValueError as error:  # as in a replay
+                    inbox.reject('image not usable', str(error), pair[0].t_ns)
                 frames += 1
             if t_s >= map_due_s:
                 make_marker(shown.t_ns, slam.line_map.segments().ends)

@@ -155,14 +155,14 @@ def drive(estimator: Estimator, calibration: Calibration, steps: Iterable[tuple[
 
     Yields, from the start on and before anything is marginalised, the frame and which points and lines were wrong.
     """
-    bootstrap, outliers = Bootstrap(estimator, calibration), (np.empty(0, np.int64), np.empty(0, np.int64))
+    bootstrap, none = Bootstrap(estimator, calibration), (np.empty(0, np.int64), np.empty(0, np.int64))
     stillness, started = Stillness(estimator.focal, estimator.options.point_sigma_px), False
     for seen, samples in steps:
         still = stillness.add(seen, samples)
         if started and samples is not None:
             outliers = estimator.step(seen, samples, still)
         else:
-            started = bootstrap.add(seen, samples, stillness.mean_imu() if still else None)
+            outliers, started = none, bootstrap.add(seen, samples, stillness.mean_imu() if still else None)
         if started:
             yield seen, outliers
             estimator.marginalise()

@@ -163,7 +163,7 @@ class Estimator:
         newest = self._predict(observations.t_ns, samples)
         w.still[newest] = still
         self._register(newest, observations)
-        just_followed = int((w.points.seen[:, newest - 1] & w.points.seen[:, newest])[:w.points.count].sum())
+        just_followed = int(w.points.seen[:w.points.count, newest - 1:newest + 1].all(axis=1).sum())
         if not self.newest_is_keyframe and not self._borders_rest(newest - 1):
             drop_state(self.solver, newest - 1)
         self._forget_ended()
@@ -172,7 +172,7 @@ class Estimator:
         if not self._followed:
             self._optimise()
         kinds = (w.points, self.solver.points), (w.lines, self.solver.lines)
-        wrong = [self._contradicted(table, kind.chi2) for table, kind in kinds]
+        wrong = [self._reject(table, kind.chi2) for table, kind in kinds]
         if not (self._followed or still):  # residuals at rest repeat each other
             for table, kind in kinds:
                 table.learn_noise(w.n, kind.pull, kind.weight, kind.size)
@@ -247,8 +247,8 @@ class Estimator:
         start_lines(n, R, position, w.R_BC, w.p_BC, todo, q.seen, q.z, q.sigma, min_sine,
                     int(o.line_form), q.values, q.origin, q.solved)
 
-    def _contradicted(self, table: LandmarkTable, chi2: F64) -> np.ndarray:
-        """Which views (rows, n) fail the chi-square gate; their landmarks lose them."""
+    def _reject(self, table: LandmarkTable, chi2: F64) -> np.ndarray:
+        """Take from landmarks the views that fail the chi-square gate; which (rows, n) that are."""
         seen, n = table.seen[:table.count], self.window.n
         expected = np.minimum(table.scale[:table.count], 1.0)[:, None]  # what is more exact than given may err as given
         wrong = table.solved[:table.count, None] & (expected**2 * chi2[:table.count] > self.options.gate_chi2)
@@ -283,7 +283,8 @@ class Estimator:
     def _is_keyframe(self, just_followed: int) -> bool:
         """By mean parallax (rotation removed) against the previous keyframe, share of its tracks left, and time.
 
-        Also when most of the corners followed from the last image, just_followed in number, are new to the window.
+        Also when more than three quarters of the corners followed from the last image, just_followed in number, are new
+        to the window.
         """
         w, n = self.window, self.window.n
         if n < 2:

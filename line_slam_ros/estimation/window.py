@@ -60,7 +60,10 @@ def whiten(cov, W):
     L = cov.copy()
     for i in range(9):
         L[i, i] += 1e-14  # of a link without noise
-    W[:] = 0.0 if factor(L, 9, 0.0) else np.nan
+    if not factor(L, 9, 0.0):
+        W[:] = np.nan
+        return
+    W[:] = 0.0
     for j in range(9):
         W[j, j] = 1.0 / L[j, j]
         for i in range(j + 1, 9):
