@@ -23,12 +23,7 @@ from line_slam_ros.geometry.camera import Camera, warm_up_lenses
 from line_slam_ros.geometry.imu import turned
 from line_slam_ros.geometry.lie_kernels import retract_rotation
 from line_slam_ros.kernel_cache import cache_is_empty, fill
-from line_slam_ros.mapping.fusion import worst_sigma
 from line_slam_ros.mapping.line_map import LineMap
-from line_slam_ros.mapping.merging import KEPT_COLUMNS, Landmarks, Merging
-from line_slam_ros.mapping.table import IdTable
-from line_slam_ros.mapping.trimming import trim
-from line_slam_ros.mapping.views import add_view, view_columns
 from line_slam_ros.simulation.features import Room, Sequence, Trajectory, calibration
 from line_slam_ros.types import Calibration, Frame
 
@@ -108,20 +103,9 @@ def warm_up_lines() -> None:
     warm_up_front_end(FrontEnd(Camera(calibration()), replace(Config(), use_points=False)), calibration())
 
 
-def warm_up_trimming() -> None:
-    """Of the line map, what finds the ends of lines."""
-    table, rows = IdTable(**view_columns(2)), np.zeros(0, np.int64)
-    add_view(table, rows, np.eye(4), np.zeros((0, 2, 2)), np.zeros((0, 2)))
-    trim(rows, np.zeros((0, 6)), table['poses'], table['ends'], table['count'], 1.0, 1.0, 1.0, np.zeros((0, 2, 3)),
-         np.zeros(0))
-
-
-def warm_up_merging() -> None:
-    """Of the line map, what tells whether lines are one."""
-    none = Landmarks(rows := np.zeros(0, np.int64), np.zeros((0, 6)), np.zeros((0, 6, 6)), np.zeros((0, 2, 3)), rows,
-                     np.zeros(0))
-    Merging(IdTable(**KEPT_COLUMNS), none, Config().mapping)
-    worst_sigma(none.pluecker, none.cov, none.ends)
+def warm_up_map() -> None:
+    """The line map."""
+    LineMap.warm_up(Config().mapping)
 
 
 def warm_up_front_end(front_end: FrontEnd, calibration: Calibration) -> None:
@@ -137,4 +121,4 @@ def warm_up_front_end(front_end: FrontEnd, calibration: Calibration) -> None:
 
 
 # without a kernel in common, those that take longest first
-PARTS = warm_up_estimator, warm_up_points, warm_up_lines, warm_up_merging, warm_up_trimming
+PARTS = warm_up_estimator, warm_up_points, warm_up_lines, warm_up_map
