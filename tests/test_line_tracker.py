@@ -2,10 +2,8 @@ import cv2
 import numpy as np
 import pytest
 from plane_scene import FOCAL, MARGIN, homography, mosaic, move, pinhole, step_edge, view
-from scipy.stats import norm
 
 from line_slam_ros.config import Lines
-from line_slam_ros.frontend import edge_kernels as edge
 from line_slam_ros.frontend.line_tracker import LineTracker
 from line_slam_ros.geometry.lie import so3_exp
 
@@ -144,42 +142,25 @@ def test_motion_goes_on_as_long_as_the_image_takes(tracker, pace):
     np.testing.assert_allclose(pixels(tracker.observations().ends[0])[:, 1], 132.0 + 6.0 * pace, atol=0.15)
 
 
-def stripe(width, blur, bright, height=1.0):
-    """Grey (WIDTH, SAMPLES) across a rising edge, its steepest place in the middle row, and how far that is off the
-    edge: of a bright or dark stripe so many px wide, the other side of so much of its height, seen through a blur."""
-    far = width if bright else -width
-    y = np.linspace(-3.0, 3.0, 6001)
-    steepest = y[np.argmax(norm.pdf(y / blur) - height * norm.pdf((y - far) / blur))]
-    rows = np.arange(edge.WIDTH) - edge.HALF + steepest
-    grey = norm.cdf(rows / blur) - height * norm.cdf((rows - far) / blur)
-    return np.repeat(50.0 * grey[:, None], edge.SAMPLES, axis=1).astype(np.float32), abs(steepest)
+@pytest.mark.parametrize('px', [2, 3, 4])
+def test_the_sides_of_a_thin_stripe_are_reported_where_they_are(px):
+    tracker = LineTracker(pinhole(), Lines(max_count=60, min_length_px=30.0))
+    scene = cv2.GaussianBlur(bar(px), (0, 0), 1.0)
+    edges = [159.5, 159.5 + px]  # between pixels
+    for _ in range(2):
+        seen = see(tracker, view(scene, np.eye(3)))
+    looks, found = (np.sort(ends[:, :, 0].mean(axis=1)) for ends in (tracker.segments.ends, pixels(seen.ends)))
+    off = np.abs(found - edges).max()
+    assert off < max(0.7 * np.abs(looks - edges).max(), 0.1)
+    assert off < 1.5 * FOCAL * seen.sigma.min()
 
 
-def displacement(values):
-    return edge.displacement(values, np.ones(edge.SAMPLES, np.float32), np.zeros(edge.SAMPLES, np.float32))
-
-
-@pytest.mark.parametrize('bright', [False, True])
-@pytest.mark.parametrize('width', [0.5, 1.5, 2.5, 3.5, 5.0])
-def test_the_sides_of_a_thin_stripe_are_not_believed_to_be_where_they_look(width, bright):
-    before = np.sqrt(edge.BLUR**2 - 1.0 / 3.0)  # what differences of grey two rows apart add
-    values, off = stripe(width, before, bright)
-    assert displacement(values) == pytest.approx(off, abs=0.25)  # where the stripe all but vanishes it is less than off
-    assert displacement(stripe(width, before, bright, 0.3)[0]) < max(0.6 * off, 0.05)
-    sharp, off = stripe(width, 0.8 * before, bright)
-    assert displacement(sharp) > off - 0.1
-
-
-def test_an_edge_by_itself_is_where_it_looks():
-    assert displacement(stripe(20.0, edge.BLUR, False)[0]) == 0.0
-    assert displacement(stripe(3.0, edge.BLUR, True, -1.0)[0]) == 0.0  # a second step up is no stripe
-
-
-def test_a_thin_stripe_in_the_image_gets_a_larger_standard_deviation():
-    thin, wide = (see(LineTracker(pinhole(), Lines(max_count=60, min_length_px=30.0)), view(scene, np.eye(3)))
-                  for scene in (cv2.GaussianBlur(bar(px), (0, 0), 1.0) for px in (2, 12)))
-    assert len(thin.ids) == len(wide.ids) == 2
-    assert thin.sigma.min() > 2.0 * wide.sigma.max()
+def test_a_wide_stripe_stays_where_it_looks_to_be_and_is_known_better():
+    thin, wide = (LineTracker(pinhole(), Lines(max_count=60, min_length_px=30.0)) for _ in range(2))
+    narrow, seen = (see(tracker, view(cv2.GaussianBlur(bar(px), (0, 0), 1.0), np.eye(3)))
+                    for tracker, px in ((thin, 3), (wide, 12)))
+    np.testing.assert_allclose(pixels(seen.ends), wide.segments.ends, atol=1e-9)
+    assert narrow.sigma.min() > 1.2 * seen.sigma.max()
 
 
 def bar(width):

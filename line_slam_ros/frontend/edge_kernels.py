@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from line_slam_ros.frontend.edge_sampling import PLACES, SAMPLES, SEEN, place, sample
+from line_slam_ros.frontend.stripes import look
 from line_slam_ros.kernel_cache import inner, kernel
 
 HALF = 6  # px, half length of a remembered profile
@@ -27,7 +28,6 @@ LOST = 0.3  # support below which an edge is not measured on
 END_STEP, INWARD, OUTWARD, GAP = 2.0, 22.0, 8.0, 3  # px, px, px, steps: how an end looks for where its edge ends
 ROWS = 2 * PEAK + 5  # of work space: as many as rows of grey from which an edge is chosen
 CLEAR = 0.4  # of the mean height of an edge, below which it ends
-BLUR = 1.4  # px, standard deviation of what an edge is seen through: optics about 1, smoothing and slopes the rest
 ALONG = np.array([2.0 * (i + 0.5) / SAMPLES - 1.0 for i in range(SAMPLES)], np.float32)  # of the samples, -1 to 1
 
 
@@ -277,43 +277,13 @@ def reach_ends(view, ends, floor, work):
         ends[side, 1] += sign * last * tv
 
 
-@inner(fastmath=True)
-def displacement(values, seen, slopes):
-    """px that an edge in the middle row of values (WIDTH, SAMPLES) may be out of place because the other side of a thin
-    stripe is so near that both are seen as one: blur drives them apart. slopes (WIDTH,): work space.
-
-    Two opposite steps 2 a apart have their steepest places 2 x apart, a = x tanh(a x) in units of the blur: the root of
-    the derivative of the difference of two Gaussians. What is less steep than the edge moves it less.
-    """
-    worst = 0.0
-    for k in range(1, WIDTH - 1):
-        slope = np.float32(0.0)
-        for i in range(SAMPLES):
-            slope += seen[i] * (values[k + 1, i] - values[k - 1, i])
-        slopes[k] = slope
-    for side in range(-1, 2, 2):
-        for far in range(2, HALF - 1):
-            at = HALF + side * far
-            before, depth, after = -slopes[at - side], -slopes[at], -slopes[at + side]
-            if depth > 0.0 and depth >= before and depth > after:
-                apart = far + 0.5 * (before - after) / (before - depth - depth + after)
-                x = max(apart / (2.0 * BLUR), 1.0)
-                a = x
-                for _ in range(30):
-                    a = x * np.tanh(a * x)
-                worst = max(worst, min(depth / max(slopes[HALF], depth), 1.0) * BLUR * (x - a))
-                break
-    return worst
-
-
 @inner
-def remember(view, ends, profile, variance, work):
-    """Fill profile (WIDTH, SAMPLES) of a segment (2, 2); add its displacement to the variance (2,) px^2 of its ends."""
+def remember(view, ends, profile, stripe, work):
+    """Fill profile (WIDTH, SAMPLES) of a segment (2, 2), and stripe (2, 2); returns its width: see stripes.look()."""
     strip(view, ends, np.int64(HALF), work)
-    push = displacement(work[2], work[1], work[5][0])
-    variance[0] += push * push
-    variance[1] += push * push
+    width = look(work[2][:WIDTH], work[1], work[5][0], stripe)
     normalise(work[2], work[1], profile, work[5])
+    return width
 
 
 @inner
@@ -334,12 +304,13 @@ def turn(R, focals, centre, ends, turned):
 
 
 @kernel
-def follow(view, floor, same, on_edge, shortest, slots, profiles, ends, motion, variance, good):
+def follow(view, floor, same, on_edge, shortest, slots, profiles, ends, motion, variance, widths, stripes, good):
     """Carry predicted segments ends (M, 2, 2), in place, to where their profiles fit best and put them on their edges.
 
     profiles (capacity, WIDTH, SAMPLES) in rows slots (M,) are those of the previous image and become those of this one.
     motion (M, 2, 2): predicted; how far the edge moved across itself in addition is added. variance (M, 2) px^2 of each
-    end across the segment. good (M,): correlation above same, support above on_edge and length above shortest.
+    end across the segment. widths (M,) px and stripes (M, 2, 2) as stripes.look() has them. good (M,): correlation
+    above same, support above on_edge and length above shortest.
     """
     work, start = workspace(), np.empty((2, 2))
     for m in range(len(ends)):
@@ -362,7 +333,7 @@ def follow(view, floor, same, on_edge, shortest, slots, profiles, ends, motion, 
         reach_ends(view, end, max(floor, CLEAR * height), work)
         if length_of(end) > shortest:
             good[m] = True
-            remember(view, end, profile, variance[m], work)
+            widths[m] = remember(view, end, profile, stripes[m], work)
 
 
 @kernel
@@ -383,9 +354,9 @@ def settle(view, floor, on_edge, shortest, wanted, ends, variance, good):
 
 
 @kernel
-def learn(view, ends, slots, profiles, variance):
-    """Fill rows slots (M,) of profiles (capacity, WIDTH, SAMPLES) with those of segments ends (M, 2, 2); see remember()
-    for variance (M, 2)."""
+def learn(view, ends, slots, profiles, widths, stripes):
+    """Fill rows slots (M,) of profiles (capacity, WIDTH, SAMPLES), and widths (M,) and stripes (M, 2, 2), with those of
+    segments ends (M, 2, 2); see remember()."""
     work = workspace()
     for m in range(len(ends)):
-        remember(view, ends[m], profiles[slots[m]], variance[m], work)
+        widths[m] = remember(view, ends[m], profiles[slots[m]], stripes[m], work)

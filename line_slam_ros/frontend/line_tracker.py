@@ -15,6 +15,7 @@ from line_slam_ros.frontend.rows import Rows
 from line_slam_ros.frontend.segment_kernels import buffers
 from line_slam_ros.frontend.segment_sets import duplicates
 from line_slam_ros.frontend.smoothing import smooth
+from line_slam_ros.frontend.stripes import BLUR, blur_of, displacement
 from line_slam_ros.geometry.camera import Camera
 from line_slam_ros.types import F64, I64, U8, LineObservations
 
@@ -37,6 +38,8 @@ class Segments(Rows):
     ages: I64  # images since detection
     ends: F64  # (M, 2, 2) px of the undistorted canvas
     variance: F64  # (M, 2) px^2 of each end across the segment
+    widths: F64  # (M,) px, and
+    stripes: F64  # (M, 2, 2), what is beside them: stripes.py
     motion: F64  # (M, 2, 2) px, last displacement beyond that of the rotation
     slots: I64  # where the tracker keeps the grey profile
 
@@ -44,15 +47,15 @@ class Segments(Rows):
     def blank(n: int) -> Segments:
         """n rows, not filled in except ages and motion."""
         return Segments(np.empty(n, np.int64), np.zeros(n, np.int64), np.empty((n, 2, 2)), np.empty((n, 2)),
-                        np.zeros((n, 2, 2)), np.empty(n, np.int64))
+                        np.empty(n), np.empty((n, 2, 2)), np.zeros((n, 2, 2)), np.empty(n, np.int64))
 
 
 class LineTracker:
     """Moving-edge tracks of segments on an undistorted canvas; ids are never reused.
 
     A segment is predicted (rotation of the camera and its own last motion), shifted across its normal to where the grey
-    profiles of the previous image fit best, and then put on the extremum of the gradient: what is reported does not
-    depend on earlier images, so nothing drifts.
+    profiles of the previous image fit best, and then put on the extremum of the gradient, from which the sides of thin
+    stripes are moved to where they really are: what is reported does not depend on earlier images, so nothing drifts.
     """
 
     def __init__(self, camera: Camera, config: Lines):
@@ -75,7 +78,7 @@ class LineTracker:
 
     def reset(self) -> None:
         """Forget every track; ids go on counting."""
-        self.segments = Segments.blank(0)
+        self.segments, self._blur = Segments.blank(0), BLUR
         self._wait = 0
 
     def forget(self, ids: I64) -> None:
@@ -84,10 +87,13 @@ class LineTracker:
             self.segments = self.segments.select(~np.isin(self.segments.ids, ids))
 
     def observations(self) -> LineObservations:
-        """The segments in the newest image."""
+        """The segments in the newest image, where their edges really are."""
         s = self.segments
-        sigma = np.sqrt(s.variance + SIGMA_FLOOR_PX**2) / self.canvas.fx
-        return LineObservations(s.ids.copy(), self.canvas.normalise(s.ends), sigma)
+        off, doubt = displacement(s.stripes, self._blur)
+        along = s.ends[:, 1] - s.ends[:, 0]
+        normal = along[:, ::-1] * (-1.0, 1.0) / np.linalg.norm(along, axis=1, keepdims=True)
+        sigma = np.sqrt(s.variance + doubt[:, None]**2 + SIGMA_FLOOR_PX**2) / self.canvas.fx
+        return LineObservations(s.ids.copy(), self.canvas.normalise(s.ends + (off[:, None] * normal)[:, None]), sigma)
 
     def take(self, image: U8) -> None:
         """Take the newest image (H, W), as received."""
@@ -111,9 +117,10 @@ class LineTracker:
         good = np.empty(len(segments), np.bool_)
         edge.follow(self._view, self._config.min_contrast, SAME_PROFILE, ON_EDGE,
                     HYSTERESIS * self._config.min_length_px, segments.slots, self._profiles, segments.ends,
-                    segments.motion, segments.variance, good)
+                    segments.motion, segments.variance, segments.widths, segments.stripes, good)
         segments.ages += 1
         self.segments = self._apart(segments if good.all() else segments.select(good), len(segments))
+        self._blur = blur_of(self.segments.widths, self.segments.stripes, self._blur)
 
     def _apart(self, segments: Segments, of: int) -> Segments:
         """Without those that lie on an earlier one of the first so many; rows are in order of their age."""
@@ -159,6 +166,6 @@ class LineTracker:
         fresh.ids = np.arange(self._next_id, self._next_id + len(fresh))
         fresh.slots = np.delete(np.arange(self._config.max_count), self.segments.slots)[:len(fresh)]
         self._next_id += len(fresh)
-        edge.learn(self._view, fresh.ends, fresh.slots, self._profiles, fresh.variance)
+        edge.learn(self._view, fresh.ends, fresh.slots, self._profiles, fresh.widths, fresh.stripes)
         self.segments = self.segments.extended(fresh)
         return True
