@@ -10,8 +10,8 @@ from line_slam_ros.geometry.line_forms import store_lines
 from line_slam_ros.geometry.lines import line_from_points
 from line_slam_ros.types import ImuNoise, LineForm
 
-STATES, POINTS, LINES, SIGMA, NOISE = 4, 20, 10, 0.02, 0.05
-RIG_SIGMA = np.array([0.1, 0.1, 0.1, 0.02, 0.02, 0.02, 0.01])
+STATES, POINTS, LINES, SIGMA, NOISE, SPREAD = 4, 20, 10, 0.02, 0.05, 0.3
+RIG_SIGMA = np.array([0.1, 0.1, 0.1, 0.02, 0.02, 0.02, 0.01, 0.1, 0.1])
 R_BC, p_BC = so3_exp([0.1, 0.2, 0.3]), np.array([0.1, 0.0, 0.05])
 
 
@@ -31,7 +31,7 @@ def solver(request):
     window.prior_H[:rows, :rows], window.prior_g[:rows] = A @ A.T, rng.normal(size=rows)
     _fill_points(window, rng)
     _fill_lines(window, rng, request.param)
-    return Solver(window, SolverOptions(np.array([0.0, 0.0, -9.81]), 4.0, 4.0, request.param))
+    return Solver(window, SolverOptions(np.array([0.0, 0.0, -9.81]), 4.0, 4.0, request.param, SPREAD))
 
 
 def _fill_points(window, rng):
@@ -78,7 +78,7 @@ def test_eliminated_normal_equations_predict_the_slope_of_the_cost(solver, seed)
     def cost(part):
         solver._restore(before)
         retract_states(w.n, w.R, w.p, w.v, w.b, part * dx)
-        retract_rig(w.R_BC, w.p_BC, w.delay, part * dx[:RIG])
+        retract_rig(w.R_BC, w.p_BC, w.delay, w.lean, part * dx[:RIG])
         retract_landmarks(solver.points.use, w.points.abr, part * solver.points.step, solver.lines.use,
                           int(solver.options.line_form), w.lines.values, part * solver.lines.step)
         return solver.cost()
@@ -113,7 +113,7 @@ def test_covariance_of_a_line_is_that_of_the_joint_equations_with_the_newest_pos
 
 def test_a_rig_that_is_not_estimated_stays_and_the_others_do_not_see_it(solver):
     """Its equations are those without its rows; part of a rig can be held, too."""
-    w, free = solver.window, np.array([0, 1, 2, 6])
+    w, free = solver.window, np.array([0, 1, 2, 6, 7, 8])
     use = np.ones(POINTS, bool), np.ones(LINES, bool)
     solver.linearise(*use)
     kept = np.concatenate([free, np.arange(RIG, w.rows)])

@@ -49,10 +49,10 @@ class Estimator:
         self.g_W = np.array([0.0, 0.0, -options.gravity])
         self.window.set_rig(calibration.T_BC[:3, :3], calibration.T_BC[:3, 3], np.concatenate([
             np.full(3, np.radians(options.extrinsic_sigma_deg)), np.full(3, options.extrinsic_sigma_m),
-            [options.time_offset_sigma_s]]))
+            [options.time_offset_sigma_s], np.full(2, np.radians(options.lean_sigma_deg))]))
         self.solver = Solver(self.window, SolverOptions(
             self.g_W, options.loss_scale**2, options.loss_scale**2,
-            LineForm.of(options.line_representation)))
+            LineForm.of(options.line_representation), float(np.radians(options.upright_spread_deg))))
         self.newest_is_keyframe, self._followed = True, False
         self._follower, self._neighbours = Follower(self.solver), Neighbours(self.solver, options.gate_chi2)
         self.failure = ''

@@ -17,7 +17,7 @@ R, p are the bodies' poses when the images were taken, twist (n, 6) their [angul
 """
 import numpy as np
 
-from line_slam_ros.estimation.window import POSE, RIG, STATE, state_row
+from line_slam_ros.estimation.window import DELAY, POSE, RIG, STATE, state_row
 from line_slam_ros.factors.line_reprojection import line_reprojection, line_residual
 from line_slam_ros.factors.point_reprojection import inverse_depth_point, point_reprojection, point_residual
 from line_slam_ros.factors.robust import CAUCHY, robust
@@ -168,7 +168,7 @@ def _append(i, f, root, sigma, twist, J_pose, J_rig, count, J, at, undo):
             delay += J_pose[k, j] * twist[f, j]
             J[f, m + k, j] = scale * J_rig[k, j]
             J[f, m + k, RIG + j] = scale * J_pose[k, j]
-        J[f, m + k, RIG - 1] = scale * delay
+        J[f, m + k, DELAY] = scale * delay
 
 
 @inner(forceinline=True)

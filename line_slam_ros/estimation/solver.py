@@ -26,7 +26,8 @@ from line_slam_ros.estimation.landmarks import (
     spread,
 )
 from line_slam_ros.estimation.rest import add_rest, add_rest_gradient, rest_cost
-from line_slam_ros.estimation.window import POSE, RIG, STATE, Window, state_row
+from line_slam_ros.estimation.uprights import upright_hessians, upright_residuals
+from line_slam_ros.estimation.window import DELAY, LEAN, POSE, RIG, STATE, Window, state_row
 from line_slam_ros.factors.imu_factor import imu_jacobians, imu_residual
 from line_slam_ros.geometry.lie_kernels import retract_rotation
 from line_slam_ros.kernel_cache import kernel
@@ -112,11 +113,12 @@ def exposures(n, R, p, v, rates, delay, R_exposed, p_exposed, twist):
         retract_rotation(R[k], turn, R_exposed[k])
 
 
-def retract_rig(R_BC, p_BC, delay, dx):
-    """Apply a step dx (7,) to the rig in place."""
+def retract_rig(R_BC, p_BC, delay, lean, dx):
+    """Apply a step dx (9,) to the rig and the lean in place."""
     retract_rotation(R_BC, dx[:3], R_BC)
     p_BC += dx[3:6]
-    delay += dx[6]
+    delay += dx[DELAY]
+    lean += dx[LEAN:]
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +129,7 @@ class SolverOptions:
     point_c2: float  # Cauchy scale of points, squared standard deviations
     line_c2: float
     line_form: LineForm = LineForm.ORTHONORMAL
+    spread: float = 0.0  # rad, of the directions of upright lines; 0: there is no such belief
     rho0: float = 0.3  # 1/m, where points without parallax are believed to be
     w_rho: float = 0.03  # m, weight of that belief: thousands of points must not add up to a belief in scale
 
@@ -168,6 +171,7 @@ class Solver:
         self.points, self.lines = _Landmarks(rows_p, slots, 3), _Landmarks(rows_l, slots, 4)
         self._J, self._count = np.zeros((slots, 2 * (rows_p + rows_l), LANES)), np.zeros(slots, np.int64)
         self._S, self._s = np.zeros((3 * rows_p + 4 * rows_l, column(slots))), np.zeros(3 * rows_p + 4 * rows_l)
+        self._up_pull, self._up_weight = np.zeros((rows_l, 2)), np.zeros(rows_l)
         self._rows = 0  # of S, s in use
         self._columns, self._own = np.zeros(column(slots)), np.zeros((0, LANES, LANES))
         self._factor: F64 | None = None  # upper triangular, of H; empty: it has none; None: not computed yet
@@ -193,7 +197,16 @@ class Solver:
         d = w.delta(self._delta)
         return (float(d @ (0.5 * (w.prior_H @ d) + w.prior_g)) + rest_cost(w) + self.inertial_cost()
                 + self.landmark_cost(self.points.use, w.points.seen, w.points.sigma, self.lines.use, w.lines.seen,
-                                     w.lines.sigma))
+                                     w.lines.sigma)
+                + self._upright_cost())
+
+    def _upright_cost(self) -> float:
+        """Of the belief in upright lines, after landmark_cost, to whose gradients it adds."""
+        q, o, kl = self.window.lines, self.options, self.lines
+        if not o.spread:
+            return 0.0
+        return upright_residuals(kl.use, int(o.line_form), q.values, q.origin, self.window.lean, o.spread,
+                                 self._up_pull, self._up_weight, kl.a)
 
     def landmark_cost(self, use_points, points_seen, point_sigma, use_lines, lines_seen, line_sigma) -> float:
         """Robust cost of observations (rows, slots) of the landmarks of rows in use; their chi2, pull and weight."""
@@ -226,6 +239,9 @@ class Solver:
         line_jacobians(n, self._R0, self._p0, w.R_BC, w.p_BC, self._twist, kl.use, q.z, q.sigma, int(o.line_form),
                        q.values, q.origin, kl.weight, self._count, self._J, kl.at, kl.undo, kl.by_land, kl.L, kl.first,
                        self._S)
+        if o.spread:
+            upright_hessians(kl.use, int(o.line_form), q.values, q.origin, w.lean, o.spread, self._up_weight, kl.L,
+                             kl.first, self._S, self.H)
         for kind in (kp, kl):
             eliminate(kind.use, kind.size, damping, kind.L, kind.first, column(n), self._S)
         self._own = np.stack([J[:k].T @ J[:k] for J, k in zip(self._J[:n], self._count, strict=False)])
@@ -239,6 +255,8 @@ class Solver:
         self.g[:] = w.prior_g + w.prior_H @ w.delta(self._delta)
         add_link_gradients(*self._links, self._link_J, self._link_r, self.g)
         add_rest_gradient(w, self._links, self.g)
+        if self.options.spread:
+            self.g[LEAN:RIG] -= self._up_pull[:len(self.lines.use)].sum(axis=0) / self.options.spread
         own = np.zeros((n, LANES))
         for kind in (self.points, self.lines):
             gradients(n, kind.use, kind.size, kind.pull, kind.at, kind.undo, kind.by_land, kind.L, kind.a, kind.first,
@@ -325,7 +343,7 @@ class Solver:
         for kind in (self.points, self.lines):
             back_substitute(kind.use, kind.size, kind.L, kind.first, t, kind.step)
         retract_states(n, w.R, w.p, w.v, w.b, dx)
-        retract_rig(w.R_BC, w.p_BC, w.delay, dx[:RIG])
+        retract_rig(w.R_BC, w.p_BC, w.delay, w.lean, dx[:RIG])
         retract_landmarks(self.points.use, w.points.abr, self.points.step, self.lines.use, int(self.options.line_form),
                           w.lines.values, self.lines.step)
         return predicted
@@ -341,8 +359,8 @@ class Solver:
     @staticmethod
     def _variables(w: Window) -> list[tuple[np.ndarray, int]]:
         n, p, q = w.n, w.points.count, w.lines.count
-        return [(w.R, n), (w.p, n), (w.v, n), (w.b, n), (w.R_BC, 3), (w.p_BC, 3), (w.delay, 1), (w.points.abr, p),
-                (w.lines.values, q)]
+        return [(w.R, n), (w.p, n), (w.v, n), (w.b, n), (w.R_BC, 3), (w.p_BC, 3), (w.delay, 1), (w.lean, 2),
+                (w.points.abr, p), (w.lines.values, q)]
 
     def covariance(self, slot: int) -> F64:
         """(15, 15) of a state given everything in the window, by the equations linearised last.

@@ -21,7 +21,8 @@ REST_SAMPLES = 1000  # inertial samples of a link between states at rest beyond 
 LEAST_WALK = 1e-6  # rad/s^2, m/s^3 per root Hz: less changes nothing in an hour, but is too stiff to solve
 STATE = 15  # [rotation, position, velocity, gyro bias, accelerometer bias]
 POSE = 6  # the part of a state that a camera sees
-RIG = 7  # [rotation and position of the camera in the body, time offset]
+RIG = 9  # what all states share: [rotation and position of the camera in the body, time offset, lean of uprights]
+DELAY, LEAN = 6, 7  # where the last two begin
 
 
 @kernel
@@ -45,13 +46,14 @@ def state_difference(n, R, p, v, b, R0, p0, v0, b0, delta):
             delta[o + 9 + i] = b[k, i] - b0[k, i]
 
 
-def rig_difference(R_BC, p_BC, delay, R_given, p_given, delta):
-    """delta (7,) = present rig minus the given one, which has no delay."""
+def rig_difference(R_BC, p_BC, delay, lean, R_given, p_given, delta):
+    """delta (9,) = present rig minus the given one, which has no delay, and the lean."""
     E = np.empty((3, 3))
     multiply_transposed(R_given, R_BC, E)
     log_so3(E, delta[:3])
     delta[3:6] = p_BC - p_given
-    delta[6] = delay[0]
+    delta[DELAY] = delay[0]
+    delta[LEAN:] = lean
 
 
 @kernel
@@ -179,6 +181,7 @@ class Window:
         self.rates = np.zeros((slots, 3))  # angular velocity of each state, rad/s, in B
         self.calibrated = np.eye(3), np.zeros(3)  # R_BC, p_BC as given
         self.R_BC, self.p_BC, self.delay = np.eye(3), np.zeros(3), np.zeros(1)  # delay: s, of the image after its stamp
+        self.lean = np.zeros(2)  # horizontal part, in W, of where the building's vertical points, rad: uprights.py
         self.rig_sigma = np.zeros(RIG)  # of what was given; what is zero is not estimated
         size = RIG + STATE * slots
         self.prior_H, self.prior_g = np.zeros((size, size)), np.zeros(size)
@@ -191,12 +194,13 @@ class Window:
         self.points.noise, self.lines.noise = Noise(), Noise()  # what went astray may have taught anything
         self.samples.clear()
         self.prior_H[:], self.prior_g[:] = 0.0, 0.0
-        self.R_BC[:], self.p_BC[:], self.delay[:] = *self.calibrated, 0.0
+        self.R_BC[:], self.p_BC[:], self.delay[:], self.lean[:] = *self.calibrated, 0.0, 0.0
         free = np.flatnonzero(self.rig_sigma)
         self.prior_H[free, free] = self.rig_sigma[free]**-2.0
 
     def set_rig(self, R_BC: F64, p_BC: F64, sigma: F64) -> None:
-        """The camera in the body as calibrated, and sigma (7,), how far that may be wrong (0: not at all)."""
+        """The camera in the body as calibrated, and sigma (9,), how far that, the time offset and
+        the lean may be off (0: not at all)."""
         self.calibrated, self.rig_sigma = (R_BC.copy(), p_BC.copy()), sigma
         self.clear()
 
@@ -206,10 +210,10 @@ class Window:
         return state_row(self.n)
 
     def delta(self, out: F64) -> F64:
-        """out (7 + 15 slots,) = present rig and states minus their first estimates, zero where not in use."""
+        """out (9 + 15 slots,) = present rig and states minus their first estimates, zero where not in use."""
         out[self.rows:] = 0.0
         state_difference(self.n, self.R, self.p, self.v, self.b, self.R0, self.p0, self.v0, self.b0, out)
-        rig_difference(self.R_BC, self.p_BC, self.delay, *self.calibrated, out[:RIG])
+        rig_difference(self.R_BC, self.p_BC, self.delay, self.lean, *self.calibrated, out[:RIG])
         return out
 
     def append(self, t_ns: int, R: F64, p: F64, v: F64, b: F64, samples: Samples | None) -> int:
