@@ -80,8 +80,10 @@ class Estimator(Checked):
     extrinsic_sigma_m: float = param(0.005, 'the same of the position of the camera in the body, m', 0.0, 0.5)
     time_offset_sigma_s: float = param(0.003, 'the same of the time offset of the images, s', 0.0, 0.1)
     upright_spread_deg: float = param(0.5, 'by how much upright lines of a building differ from each other (standard '
-                                      'deviation); they tell roll and pitch, but with 0, deg', 0.0, 10.0)
-    lean_sigma_deg: float = param(0.2, 'by how much all of them may be off the vertical together, deg', 0.0, 10.0)
+                                      'deviation), which tell roll and pitch; 0: they are not believed to be '
+                                      'upright, deg', 0.0, 10.0)
+    lean_sigma_deg: float = param(0.2, 'by how much all of them together are off the vertical (standard deviation), '
+                                  'deg', 0.0, 10.0)
     init_window_s: float = param(2.0, 'longest stretch of images that a start from motion uses, s', 0.5, 10.0)
     init_max_scale_sigma: float = param(0.05, 'relative uncertainty of scale at which a start is accepted', 0.001, 1.0)
     keyframe_max_s: float = param(1.0, 'longest time between keyframes while moving, s', 0.1, 10.0)

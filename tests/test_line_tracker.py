@@ -149,6 +149,7 @@ def test_the_sides_of_a_thin_stripe_are_reported_where_they_are(px):
     edges = [159.5, 159.5 + px]  # between pixels
     for _ in range(2):
         seen = see(tracker, view(scene, np.eye(3)))
+    assert len(seen.ids) == 2
     looks, found = (np.sort(ends[:, :, 0].mean(axis=1)) for ends in (tracker.segments.ends, pixels(seen.ends)))
     off = np.abs(found - edges).max()
     assert off < max(0.7 * np.abs(looks - edges).max(), 0.1)
@@ -159,6 +160,7 @@ def test_a_wide_stripe_stays_where_it_looks_to_be_and_is_known_better():
     thin, wide = (LineTracker(pinhole(), Lines(max_count=60, min_length_px=30.0)) for _ in range(2))
     narrow, seen = (see(tracker, view(cv2.GaussianBlur(bar(px), (0, 0), 1.0), np.eye(3)))
                     for tracker, px in ((thin, 3), (wide, 12)))
+    assert len(narrow.ids) == len(seen.ids) == 2
     np.testing.assert_allclose(pixels(seen.ends), wide.segments.ends, atol=1e-9)
     assert narrow.sigma.min() > 1.2 * seen.sigma.max()
 

@@ -127,6 +127,26 @@ def test_a_rig_that_is_not_estimated_stays_and_the_others_do_not_see_it(solver):
     assert (w.p_BC == before).all()
 
 
+@pytest.mark.parametrize('held', [slice(3, 6), slice(7, 9)])
+def test_what_is_held_adds_nothing_to_the_covariance_of_lines(solver, held):
+    w, use = solver.window, (np.ones(POINTS, bool), np.ones(LINES, bool))
+    w.prior_H[held, held] += 1e12 * np.eye(held.stop - held.start)
+    solver.linearise(*use)
+    expected = solver.line_covariances(np.arange(LINES))
+    w.rig_sigma[held] = 0.0
+    solver.linearise(*use)
+    np.testing.assert_allclose(solver.line_covariances(np.arange(LINES)), expected, rtol=1e-4,
+                               atol=1e-6 * np.abs(expected).max())
+
+
+def test_a_line_that_lost_its_direction_takes_no_part(solver):
+    w = solver.window
+    w.lines.values[0] = np.nan
+    assert np.isfinite(solver.cost())
+    before = solver.cost()
+    assert solver.optimise(4) < before
+
+
 def test_equations_without_a_solution_are_told(solver):
     solver.linearise(np.ones(POINTS, bool), np.ones(LINES, bool))
     solver.H[:] = -solver.H

@@ -50,6 +50,14 @@ def test_the_sides_of_a_stripe_are_moved_to_where_they_are(blur, width, bright, 
     assert sigma[0] < 0.45 * wrong * blur
 
 
+@pytest.mark.parametrize('height', [1.5, 2.0, 4.0])
+@pytest.mark.parametrize('width', [1.0, 2.0, 3.0])
+def test_a_steeper_side_is_known_to_make_an_edge_uncertain(height, width):
+    grey, off = stripe(width, stripes.BLUR, True, height)
+    found, sigma = stripes.displacement(looks(grey)[1], stripes.BLUR)
+    assert abs(found[0] - off) < 3.0 * sigma[0]
+
+
 def test_a_weaker_side_moves_an_edge_less():
     (equal, off), (weaker, less) = stripe(1.5, stripes.BLUR, True), stripe(1.5, stripes.BLUR, True, 0.3)
     found = [stripes.displacement(looks(grey)[1], stripes.BLUR)[0][0] for grey in (equal, weaker)]
@@ -95,6 +103,13 @@ def test_the_blur_is_that_of_the_sharpest_steps():
         blur = stripes.blur_of(widths, beside, blur)
     assert blur == pytest.approx(1.0, rel=1e-3)
     assert stripes.blur_of(widths[:stripes.STEPS - 1], beside[:stripes.STEPS - 1], 2.5) == 2.5  # too few
+
+
+def test_the_first_blur_is_taken_as_it_is_and_no_edges_have_none():
+    widths, beside = np.array([1.1, 1.1, 1.1] + [stripes.FLAT] * 12), np.zeros((15, 2, 2))
+    assert stripes.blur_of(widths, beside, None) is None
+    widths[3:5] = 1.1
+    assert stripes.blur_of(widths, beside, None) == pytest.approx(1.1)
 
 
 def test_without_segments_nothing_moves():

@@ -13,7 +13,7 @@ from line_slam_ros.estimation.neighbours import Neighbours
 from line_slam_ros.estimation.shift import FEW_CORNERS, corner_shifts, segment_shifts
 from line_slam_ros.estimation.solver import CONVERGED, LEAST_DAMPING, Solver, SolverOptions
 from line_slam_ros.estimation.triangulation import lines_in_cameras, start_lines, start_points
-from line_slam_ros.estimation.window import RIG, LandmarkTable, Window, state_row
+from line_slam_ros.estimation.window import DELAY, RIG, LandmarkTable, Window, state_row
 from line_slam_ros.geometry.lie import rigid
 from line_slam_ros.geometry.line_forms import unit_world_lines
 from line_slam_ros.types import F64, I64, Calibration, LineForm, Observations, RigCorrection, Samples
@@ -113,7 +113,8 @@ class Estimator:
         """How far the refined calibration is from the given one."""
         w = self.window
         rig = w.delta(np.empty(len(w.prior_g)))[:RIG]
-        return RigCorrection(float(np.degrees(np.linalg.norm(rig[:3]))), float(np.linalg.norm(rig[3:6])), float(rig[6]))
+        return RigCorrection(float(np.degrees(np.linalg.norm(rig[:3]))), float(np.linalg.norm(rig[3:6])),
+                             float(rig[DELAY]))
 
     def covariance(self) -> F64:
         """(9, 9) of the newest state's [rotation in B, position in W, velocity in W]."""

@@ -129,7 +129,7 @@ class SolverOptions:
     point_c2: float  # Cauchy scale of points, squared standard deviations
     line_c2: float
     line_form: LineForm = LineForm.ORTHONORMAL
-    spread: float = 0.0  # rad, of the directions of upright lines; 0: there is no such belief
+    upright_spread: float = 0.0  # rad, of the directions of upright lines; 0: they are not believed to be upright
     rho0: float = 0.3  # 1/m, where points without parallax are believed to be
     w_rho: float = 0.03  # m, weight of that belief: thousands of points must not add up to a belief in scale
 
@@ -171,7 +171,7 @@ class Solver:
         self.points, self.lines = _Landmarks(rows_p, slots, 3), _Landmarks(rows_l, slots, 4)
         self._J, self._count = np.zeros((slots, 2 * (rows_p + rows_l), LANES)), np.zeros(slots, np.int64)
         self._S, self._s = np.zeros((3 * rows_p + 4 * rows_l, column(slots))), np.zeros(3 * rows_p + 4 * rows_l)
-        self._up_pull, self._up_weight = np.zeros((rows_l, 2)), np.zeros(rows_l)
+        self._upright_pull, self._upright_weight = np.zeros((rows_l, 2)), np.zeros(rows_l)
         self._rows = 0  # of S, s in use
         self._columns, self._own = np.zeros(column(slots)), np.zeros((0, LANES, LANES))
         self._factor: F64 | None = None  # upper triangular, of H; empty: it has none; None: not computed yet
@@ -203,10 +203,10 @@ class Solver:
     def _upright_cost(self) -> float:
         """Of the belief in upright lines, after landmark_cost, to whose gradients it adds."""
         q, o, kl = self.window.lines, self.options, self.lines
-        if not o.spread:
+        if not o.upright_spread:
             return 0.0
-        return upright_residuals(kl.use, int(o.line_form), q.values, q.origin, self.window.lean, o.spread,
-                                 self._up_pull, self._up_weight, kl.a)
+        return upright_residuals(kl.use, int(o.line_form), q.values, q.origin, self.window.lean, o.upright_spread,
+                                 self._upright_pull, self._upright_weight, kl.a)
 
     def landmark_cost(self, use_points, points_seen, point_sigma, use_lines, lines_seen, line_sigma) -> float:
         """Robust cost of observations (rows, slots) of the landmarks of rows in use; their chi2, pull and weight."""
@@ -239,9 +239,9 @@ class Solver:
         line_jacobians(n, self._R0, self._p0, w.R_BC, w.p_BC, self._twist, kl.use, q.z, q.sigma, int(o.line_form),
                        q.values, q.origin, kl.weight, self._count, self._J, kl.at, kl.undo, kl.by_land, kl.L, kl.first,
                        self._S)
-        if o.spread:
-            upright_hessians(kl.use, int(o.line_form), q.values, q.origin, w.lean, o.spread, self._up_weight, kl.L,
-                             kl.first, self._S, self.H)
+        if o.upright_spread:
+            upright_hessians(kl.use, int(o.line_form), q.values, q.origin, w.lean, o.upright_spread,
+                             self._upright_weight, kl.L, kl.first, self._S, self.H)
         for kind in (kp, kl):
             eliminate(kind.use, kind.size, damping, kind.L, kind.first, column(n), self._S)
         self._own = np.stack([J[:k].T @ J[:k] for J, k in zip(self._J[:n], self._count, strict=False)])
@@ -255,8 +255,8 @@ class Solver:
         self.g[:] = w.prior_g + w.prior_H @ w.delta(self._delta)
         add_link_gradients(*self._links, self._link_J, self._link_r, self.g)
         add_rest_gradient(w, self._links, self.g)
-        if self.options.spread:
-            self.g[LEAN:RIG] -= self._up_pull[:len(self.lines.use)].sum(axis=0) / self.options.spread
+        if self.options.upright_spread:
+            self.g[LEAN:RIG] -= self._upright_pull[:len(self.lines.use)].sum(axis=0) / self.options.upright_spread
         own = np.zeros((n, LANES))
         for kind in (self.points, self.lines):
             gradients(n, kind.use, kind.size, kind.pull, kind.at, kind.undo, kind.by_land, kind.L, kind.a, kind.first,
@@ -381,6 +381,8 @@ class Solver:
         add_link_hessians(*links, w.R0, w.p0, w.v0, w.b0, w.dt, w.dR, w.dp, w.dv, w.J_b, w.b_lin, w.W, w.w_b, o.g_W,
                           self._link_J, H)
         add_rest(w, links, H)
+        if o.upright_spread:
+            H[LEAN:RIG, LEAN:RIG] += np.eye(2) * self._upright_weight[:len(self.lines.use)].sum() / o.upright_spread**2
         add_hessian(slot + 1, self._own, np.zeros((column(slot + 1), column(slot + 1))), H)
         hold(H, np.flatnonzero(w.rig_sigma == 0.0))
         latest = regular(cholesky(H[:rows, :rows]))[-STATE:, -STATE:]
@@ -401,6 +403,8 @@ class Solver:
         ties = np.zeros((rows, len(seen)))
         ties[seen, np.arange(len(seen))] = 1.0
         C = solve(regular(cholesky(H)), ties)[seen]
+        held = np.flatnonzero(self.window.rig_sigma == 0.0)
+        C[held, held] = 0.0
         S = self._S[self.lines.first[lines, None] + np.arange(4), :len(seen)]
         inverse = np.linalg.inv(self.lines.L[lines]).transpose(0, 2, 1)
         AW = inverse @ S

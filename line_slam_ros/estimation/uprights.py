@@ -11,22 +11,11 @@ import numpy as np
 
 from line_slam_ros.estimation.window import LEAN
 from line_slam_ros.factors.robust import CAUCHY, robust
+from line_slam_ros.factors.upright import upright
 from line_slam_ros.geometry.line_forms import world_line
-from line_slam_ros.kernel_cache import inner, kernel
+from line_slam_ros.kernel_cache import kernel
 
-
-@inner
-def upright(d_W, C, lean, spread, r, J):
-    """Residual r (2,) of a line of direction d_W, any length and either way, against the lean (2,) rad of the building,
-    over the spread, rad. J (2, 4): its Jacobian by the step of the line, of which C (6, 4) is the tangent."""
-    length = np.sqrt(d_W[0] * d_W[0] + d_W[1] * d_W[1] + d_W[2] * d_W[2])
-    up = 1.0 if d_W[2] >= 0.0 else -1.0
-    for k in range(2):
-        r[k] = (up * d_W[k] / length - lean[k]) / spread
-    for j in range(4):
-        along = (d_W[0] * C[3, j] + d_W[1] * C[4, j] + d_W[2] * C[5, j]) / (length * length)
-        for k in range(2):
-            J[k, j] = up * (C[3 + k, j] - d_W[k] * along) / (length * spread)
+SCALE = 1.0  # of the loss, squared standard deviations
 
 
 @kernel
@@ -40,8 +29,9 @@ def upright_residuals(use, form, values, origin, lean, spread, pull, weight, a):
         if not use[i]:
             continue
         world_line(form, values[i], origin[i], n_W, d_W, C)
-        upright(d_W, C, lean, spread, r, J)
-        rho, weight[i] = robust(CAUCHY, r[0] * r[0] + r[1] * r[1], 1.0)
+        if not upright(d_W, C, lean, spread, r, J):
+            continue
+        rho, weight[i] = robust(CAUCHY, r[0] * r[0] + r[1] * r[1], SCALE)
         cost += rho
         for k in range(2):
             pull[i, k] = weight[i] * r[k]
@@ -56,7 +46,7 @@ def upright_hessians(use, form, values, origin, lean, spread, weight, L, first, 
     the lean in S (landmarks.py), before they are eliminated, and to the Hessian H of the window."""
     r, J, n_W, d_W, C = np.empty(2), np.empty((2, 4)), np.empty(3), np.empty(3), np.empty((6, 4))
     for i in range(len(use)):
-        if not use[i]:
+        if not (use[i] and weight[i] > 0.0):
             continue
         world_line(form, values[i], origin[i], n_W, d_W, C)
         upright(d_W, C, lean, spread, r, J)

@@ -1,8 +1,9 @@
 """What the optimiser works on: states of the sliding window, their inertial links, landmark tables, the rig, the prior.
 
 Structure of arrays, allocated once; slot 0 is the oldest state, slot n - 1 the newest. The rig is how camera and IMU
-belong together: the camera's pose in the body, and by how much an image was taken later than its stamp says. Its rows
-in the equations come first, then those of the slots (state_row).
+belong together: the camera's pose in the body, and by how much an image was taken later than its stamp says. With it
+goes what else all states share, the lean of upright lines. These rows of the equations come first, then those of the
+slots (state_row).
 """
 from __future__ import annotations
 
@@ -199,9 +200,9 @@ class Window:
         self.prior_H[free, free] = self.rig_sigma[free]**-2.0
 
     def set_rig(self, R_BC: F64, p_BC: F64, sigma: F64) -> None:
-        """The camera in the body as calibrated, and sigma (9,), how far that, the time offset and
-        the lean may be off (0: not at all)."""
-        self.calibrated, self.rig_sigma = (R_BC.copy(), p_BC.copy()), sigma
+        """The camera in the body as calibrated, and sigma (9,), how far that, the time offset and the lean may be off
+        (0: not at all)."""
+        self.calibrated, self.rig_sigma = (R_BC.copy(), p_BC.copy()), sigma.copy()
         self.clear()
 
     @property

@@ -38,8 +38,8 @@ class Segments(Rows):
     ages: I64  # images since detection
     ends: F64  # (M, 2, 2) px of the undistorted canvas
     variance: F64  # (M, 2) px^2 of each end across the segment
-    widths: F64  # (M,) px, and
-    stripes: F64  # (M, 2, 2), what is beside them: stripes.py
+    widths: F64  # (M,) px, equivalent width: stripes.look()
+    stripes: F64  # (M, 2, 2), opposite steps to both sides: stripes.look()
     motion: F64  # (M, 2, 2) px, last displacement beyond that of the rotation
     slots: I64  # where the tracker keeps the grey profile
 
@@ -78,7 +78,8 @@ class LineTracker:
 
     def reset(self) -> None:
         """Forget every track; ids go on counting."""
-        self.segments, self._blur = Segments.blank(0), BLUR
+        self.segments = Segments.blank(0)
+        self._blur: float | None = None  # px; None: not measured yet
         self._wait = 0
 
     def forget(self, ids: I64) -> None:
@@ -89,7 +90,7 @@ class LineTracker:
     def observations(self) -> LineObservations:
         """The segments in the newest image, where their edges really are."""
         s = self.segments
-        off, doubt = displacement(s.stripes, self._blur)
+        off, doubt = displacement(s.stripes, self._blur or BLUR)
         along = s.ends[:, 1] - s.ends[:, 0]
         normal = along[:, ::-1] * (-1.0, 1.0) / np.linalg.norm(along, axis=1, keepdims=True)
         sigma = np.sqrt(s.variance + doubt[:, None]**2 + SIGMA_FLOOR_PX**2) / self.canvas.fx

@@ -3,6 +3,9 @@
 Door frames, cables, joints and skirtings are a few pixels wide or less. Both their edges are seen through the blur of
 the lens, of motion and of the slopes' own differences, and the steepest places that a tracker finds lie up to a blur's
 standard deviation too far out. As long as the camera comes nearer this changes slowly, and looks like parallax.
+
+One number stands for the blur of an image, though that of motion has a direction. From a blur of 2 px on the other side
+of a stripe lies outside what is looked at.
 """
 from __future__ import annotations
 
@@ -51,8 +54,8 @@ def look(values, seen, slopes, stripe):
     """Equivalent width, px, of the edge in the middle row of values (rows, SAMPLES): the standard deviation of the blur
     if it is a single step; FLAT if it is none.
 
-    stripe (2, 2) <- for each side, how far along the normal the nearest opposite step looks to be, and how steep that
-    is in terms of the edge, 1 at most; 0, 0: there is none. slopes (rows,): work space.
+    stripe (2, 2) <- for each side, how far along the normal the nearest opposite step looks to be, and its slope over
+    that of the edge; 0, 0: there is none. slopes (rows,): work space.
     """
     zero, half, middle = np.float32(0.0), np.float32(0.5), len(values) // 2
     slopes[0] = slopes[2 * middle] = zero
@@ -77,25 +80,29 @@ def look(values, seen, slopes, stripe):
             before, depth, after = -slopes[at - sign], -slopes[at], -slopes[at + sign]
             if depth > zero and depth >= before and depth > after:
                 stripe[side, 0] = sign * (far + half * (before - after) / (before - depth - depth + after))
-                stripe[side, 1] = min(depth / steepest, np.float32(1.0))
+                stripe[side, 1] = depth / steepest
                 break
     return height / (steepest * ROOT_TWO_PI)
 
 
-def blur_of(widths: F64, stripes: F64, blur: float) -> float:
-    """The blur, px, after an image with edges of such widths (M,) and stripes (M, 2, 2), see look(); blur: before."""
-    steps = widths[(stripes[:, :, 1] == 0.0).all(axis=1)]
+def blur_of(widths: F64, stripes: F64, before: float | None) -> float | None:
+    """The blur, px, after an image with edges of such widths (M,) and stripes (M, 2, 2), see look(); None: unknown."""
+    steps = widths[(widths < FLAT) & (stripes[:, :, 1] == 0.0).all(axis=1)]
     if len(steps) < STEPS:
-        return blur
-    return blur + SOON * (float(np.quantile(steps, SHARPEST)) - blur)
+        return before
+    found = float(np.quantile(steps, SHARPEST))
+    return found if before is None else before + SOON * (found - before)
 
 
 def displacement(stripes: F64, blur: float) -> tuple[F64, F64]:
     """How far along their normals edges with such stripes (M, 2, 2) are from where they look to be, (M,) px, and the
     standard deviation of this.
 
-    The less steep side of a stripe moves the other one less, in proportion.
+    The less steep side of a stripe moves the other one less, in proportion. By how much the steeper one moves the other
+    is hardly known.
     """
-    apart, share = np.abs(stripes[:, :, 0]) / blur, blur * stripes[:, :, 1]
-    off = (np.sign(stripes[:, :, 0]) * share * np.interp(apart, APART, OFF)).sum(axis=1)
-    return off, np.sqrt(((share * np.interp(apart, APART, OFF_SIGMA))**2).sum(axis=1))
+    side, apart, ratio = np.sign(stripes[:, :, 0]), np.abs(stripes[:, :, 0]) / blur, stripes[:, :, 1]
+    share = blur * np.minimum(ratio, 1.0)
+    off = (side * share * np.interp(apart, APART, OFF)).sum(axis=1)
+    doubts = np.hypot(share * np.interp(apart, APART, OFF_SIGMA), blur * np.maximum(ratio - 1.0, 0.0))
+    return off, np.linalg.norm(doubts, axis=1)
