@@ -22,6 +22,7 @@ BLUR_ERROR = 0.1  # relative standard deviation of the blur
 APART_ERROR = 0.08  # of how far apart two sides look to be, in units of the blur: too far, and standard deviation
 THINNEST, WIDEST = 0.3, 8.0  # stripes, in units of the blur, between which all are as likely in proportion
 FLAT = 1e6  # px, width of what is no edge
+STEEPER = 0.3  # standard deviation, in units of the blur, for each time that the slope beside is steeper than the edge
 ROOT_TWO_PI = np.float32(np.sqrt(2.0 * np.pi))
 
 
@@ -104,5 +105,5 @@ def displacement(stripes: F64, blur: float) -> tuple[F64, F64]:
     side, apart, ratio = np.sign(stripes[:, :, 0]), np.abs(stripes[:, :, 0]) / blur, stripes[:, :, 1]
     share = blur * np.minimum(ratio, 1.0)
     off = (side * share * np.interp(apart, APART, OFF)).sum(axis=1)
-    doubts = np.hypot(share * np.interp(apart, APART, OFF_SIGMA), blur * np.maximum(ratio - 1.0, 0.0))
+    doubts = np.hypot(share * np.interp(apart, APART, OFF_SIGMA), STEEPER * blur * np.maximum(ratio - 1.0, 0.0))
     return off, np.linalg.norm(doubts, axis=1)
