@@ -197,13 +197,21 @@ def test_information_is_all_there_is_where_no_landmark_is(frame):
         np.testing.assert_allclose(solver.information(slot), expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
 
 
-def test_landmarks_that_are_given_can_only_add_information(frame):
+@pytest.mark.parametrize('from_newest', [0, 1, 4])
+def test_landmarks_that_are_given_can_only_add_information(frame, from_newest):
     after = copy.deepcopy(frame[0])
     after.linearise()
-    newest = after.window.n - 1
-    left = after.solver.covariance(newest) - np.linalg.inv(after.solver.information(newest))
-    own = np.sqrt(np.diag(left))
-    assert np.linalg.eigvalsh(left / np.outer(own, own)).min() > -1e-6
+    owed = after.solver.owed_to_landmarks(after.window.n - 1 - from_newest)
+    own = np.sqrt(np.diag(owed))
+    assert np.linalg.eigvalsh(owed / np.outer(own, own)).min() > -1e-6
+
+
+def test_what_is_owed_to_landmarks_is_the_rest_of_the_newest_covariance(frame):
+    after = copy.deepcopy(frame[0])
+    after.linearise()
+    newest, solver = after.window.n - 1, after.solver
+    rest = np.linalg.inv(solver.information(newest)) + solver.owed_to_landmarks(newest)
+    np.testing.assert_allclose(rest, solver.covariance(newest), rtol=1e-6, atol=1e-9 * np.abs(rest).max())
 
 
 def test_what_does_not_settle_moves_nothing(follower):

@@ -53,7 +53,7 @@ class Follower:
         """
         w = self._solver.window
         self._information = self._solver.information(slot)
-        self._common = self._solver.covariance(slot) - np.linalg.inv(self._information)
+        self._common = self._solver.owed_to_landmarks(slot)
         for mine, theirs in zip(self._state, (w.R, w.p, w.v, w.b), strict=True):
             mine[0] = theirs[slot]
         for table, kind in ((w.points, self._solver.points), (w.lines, self._solver.lines)):

@@ -367,26 +367,35 @@ class Solver:
 
         LinAlgError when these have no solution.
         """
-        latest = np.linalg.inv(regular(self._factored())[state_row(slot):, state_row(slot):])[:STATE]
-        return latest @ latest.T
+        return _covariance(regular(self._factored()), slot)
+
+    def owed_to_landmarks(self, slot: int) -> F64:
+        """(15, 15) of a state's covariance: what would be gone of it were the landmarks known. As for covariance."""
+        return self.covariance(slot) - _covariance(self._given_landmarks(self.window.n - 1), slot)
 
     def information(self, slot: int) -> F64:
         """(15, 15) about a state, given the landmarks, from all that comes before it and what it sees itself.
 
-        The rest of a state before the newest is left out, as in linearise. By the Jacobians taken last; LinAlgError
-        when the equations have no solution.
+        By the Jacobians taken last; LinAlgError when the equations have no solution.
         """
-        w, o, links, rows = self.window, self.options, (0, slot), state_row(slot + 1)
+        latest = self._given_landmarks(slot)[-STATE:, -STATE:]
+        return latest.T @ latest
+
+    def _given_landmarks(self, last: int) -> F64:
+        """Factor of the equations of rig and states up to a last one, were the landmarks known.
+
+        The rest of a state before the newest is left out, as in linearise.
+        """
+        w, o, links, rows = self.window, self.options, (0, last), state_row(last + 1)
         H = w.prior_H.copy()
         add_link_hessians(*links, w.R0, w.p0, w.v0, w.b0, w.dt, w.dR, w.dp, w.dv, w.J_b, w.b_lin, w.W, w.w_b, o.g_W,
                           self._link_J, H)
         add_rest(w, links, H)
         if o.upright_spread:
             H[LEAN:RIG, LEAN:RIG] += np.eye(2) * self._upright_weight[:len(self.lines.use)].sum() / o.upright_spread**2
-        add_hessian(slot + 1, self._own, np.zeros((column(slot + 1), column(slot + 1))), H)
+        add_hessian(last + 1, self._own, np.zeros((column(last + 1), column(last + 1))), H)
         hold(H, np.flatnonzero(w.rig_sigma == 0.0))
-        latest = regular(cholesky(H[:rows, :rows]))[-STATE:, -STATE:]
-        return latest.T @ latest
+        return regular(cholesky(H[:rows, :rows]))
 
     def line_covariances(self, lines: np.ndarray) -> F64:
         """(L, 4, 4) of lines (rows when Jacobians were taken last) in their tangent, as the newest camera knows them.
@@ -410,3 +419,9 @@ class Solver:
         AW = inverse @ S
         own = inverse @ inverse.transpose(0, 2, 1) / np.minimum(self.lines.scale[lines], 1.0)[:, None, None]**2
         return own + AW @ C @ AW.transpose(0, 2, 1)
+
+
+def _covariance(factor: F64, slot: int) -> F64:
+    """(15, 15) of a state by the factor of equations of rig and states."""
+    latest = np.linalg.inv(factor[state_row(slot):, state_row(slot):])[:STATE]
+    return latest @ latest.T
