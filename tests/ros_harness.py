@@ -8,7 +8,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +19,16 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
 
 from line_slam_ros.cli.bag_reader import open_bag
+from line_slam_ros.cli.playing import schedule
 from msg_adapters.factories import ros_messages
 
-START_S = 120.0  # a node that finds no compiled code yet compiles
+START_S = 240.0  # a node that finds no compiled code yet compiles
 MATCH_S = 0.5  # after a writer knows a reader, until the reader knows the writer
 LATCHED = QoSProfile(depth=2, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 OFFICE_BAG, OFFICE_CALIBRATION = OFFICE / 'bag', OFFICE / 'calibration.yaml'
 OFFICE_ARGS = ('-p', f'calibration_file:={OFFICE_CALIBRATION}', '-p', 'image_transport:=compressed',
                '-r', 'image:=/cam0/image_raw', '-r', 'imu:=/imu0', '-r', 'pose:=/ground_truth/pose')
+LOSSLESS = ('-p', 'max_frames:=1000', '-p', 'node.reliability:=reliable')  # however busy the machine
 ROOT = Path(__file__).parents[1]
 
 
@@ -64,14 +66,19 @@ class Process:
 
 
 @contextmanager
-def slam_node(log: Path, *ros_args: str, env: dict[str, str] | None = None) -> Iterator[Process]:
-    """line_slam_node in a process."""
-    process = Process(log, '-m', 'line_slam_ros.nodes.line_slam_node', '--ros-args', *ros_args, env=env)
+def running(log: Path, *command: str, env: dict[str, str] | None = None) -> Iterator[Process]:
+    """A child that does not outlive the block."""
+    process = Process(log, *command, env=env)
     try:
         yield process
     finally:
         if process.is_running:
             process.stop(signal.SIGTERM)
+
+
+def slam_node(log: Path, *ros_args: str, env: dict[str, str] | None = None) -> AbstractContextManager[Process]:
+    """line_slam_node in a process."""
+    return running(log, '-m', 'line_slam_ros.nodes.line_slam_node', '--ros-args', *ros_args, env=env)
 
 
 class Peer:
@@ -129,6 +136,12 @@ class Peer:
         self.heard['/diagnostics'].clear()
         return self.spin_until(lambda: any(text in whole(array) for array in self.heard['/diagnostics']), timeout)
 
+    def node_caught_up(self, timeout: float) -> bool:
+        """Whether from now on a diagnostic comes by which no image waits in the node."""
+        before = len(self.heard['/diagnostics'])
+        return self.spin_until(lambda: any('frames waiting = 0' in whole(array)
+                                           for array in self.heard['/diagnostics'][before:]), timeout)
+
     def last_diagnosis(self) -> str:
         """For assertion messages."""
         return whole(self.heard['/diagnostics'][-1]) if self.heard['/diagnostics'] else 'no diagnostics came'
@@ -141,16 +154,9 @@ class Peer:
             image = publishers['/cam0/image_raw/compressed']
             assert self.spin_until(image.get_subscription_count, START_S), 'nobody hears the images'
             self.spin(MATCH_S)
-            first = began = None
-            for topic, t_ns, data in bag.log():
-                first = t_ns if first is None else first
-                offset = (t_ns - first) * 1e-9 - start
-                if offset > seconds:
-                    break
-                if offset >= 0:
-                    began = time.monotonic() if began is None else began
-                    self.spin(began + offset / rate - time.monotonic())
-                    publishers[topic].publish(data)
+            for due, topic, _, data in schedule(bag.log(), start, seconds, rate):
+                self.spin(due - time.monotonic())
+                publishers[topic].publish(data)
         self.spin(1.0)
         for publisher in publishers.values():
             self.node.destroy_publisher(publisher)

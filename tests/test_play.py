@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +14,17 @@ import pytest
 pytest.importorskip('rclpy')
 import message_samples
 import rclpy
-from ros_harness import OFFICE_ARGS, OFFICE_BAG, OFFICE_CALIBRATION, Peer, Process, slam_node
+from ros_harness import (
+    LOSSLESS,
+    OFFICE_ARGS,
+    OFFICE_BAG,
+    OFFICE_CALIBRATION,
+    START_S,
+    Peer,
+    Process,
+    running,
+    slam_node,
+)
 
 from line_slam_ros.cli import playing
 from line_slam_ros.cli.bag_reader import open_bag
@@ -24,8 +35,8 @@ from msg_adapters.sensors import stamp_ns
 SECONDS = 8.0
 
 
-def play(log: Path, *arguments: object) -> Process:
-    return Process(log, '-m', 'line_slam_ros.cli.main', 'play', *map(str, arguments))
+def play(log: Path, *arguments: object) -> AbstractContextManager[Process]:
+    return running(log, '-m', 'line_slam_ros.cli.main', 'play', *map(str, arguments))
 
 
 @pytest.fixture(scope='module')
@@ -50,8 +61,8 @@ def test_messages_arrive_in_order_as_they_were_recorded(peer: Peer, still_bag: P
              '/clock': 'rosgraph_msgs/msg/Clock'}
     for topic, kind in kinds.items():
         peer.hear(topic, kind, 500)
-    process = play(tmp_path / 'log', still_bag, '--clock')
-    assert peer.spin_until(lambda: not process.is_running, 60.0)
+    with play(tmp_path / 'log', still_bag, '--clock') as process:
+        assert peer.spin_until(lambda: not process.is_running, 60.0)
     peer.spin(0.5)
     assert process.wait() == 0, process.text
     with open_bag(still_bag) as bag:
@@ -66,8 +77,8 @@ def test_messages_arrive_in_order_as_they_were_recorded(peer: Peer, still_bag: P
 
 def test_part_of_a_bag(peer: Peer, tmp_path: Path) -> None:
     peer.hear('/imu0', 'sensor_msgs/msg/Imu', 1000)
-    process = play(tmp_path / 'log', OFFICE_BAG, '--start', 3.0, '--duration', 0.5, '--rate', 2.0)
-    assert peer.spin_until(lambda: not process.is_running, 60.0)
+    with play(tmp_path / 'log', OFFICE_BAG, '--start', 3.0, '--duration', 0.5, '--rate', 2.0) as process:
+        assert peer.spin_until(lambda: not process.is_running, 60.0)
     peer.spin(0.5)
     assert process.wait() == 0, process.text
     first, *_, last = [stamp_ns(m) - 1_701_010_000_000_000_000 for m in peer.heard['/imu0']]
@@ -76,15 +87,15 @@ def test_part_of_a_bag(peer: Peer, tmp_path: Path) -> None:
 
 def test_loop_ends_with_a_signal(peer: Peer, still_bag: Path, tmp_path: Path) -> None:
     peer.hear(bag_samples.IMU, 'sensor_msgs/msg/Imu', 1000)
-    process = play(tmp_path / 'log', still_bag, '--loop')
-    assert peer.spin_until(lambda: len(peer.heard[bag_samples.IMU]) > 250, 60.0), process.text
-    assert process.stop(signal.SIGINT) == 130, process.text
+    with play(tmp_path / 'log', still_bag, '--loop') as process:
+        assert peer.spin_until(lambda: len(peer.heard[bag_samples.IMU]) > 250, 60.0), process.text
+        assert process.stop(signal.SIGINT) == 130, process.text
     assert 'Traceback' not in process.text
 
 
 def test_nobody_listens(ros_domain: int, still_bag: Path, tmp_path: Path) -> None:
-    process = play(tmp_path / 'log', still_bag, '--wait', 0.5)
-    assert process.wait() == 1
+    with play(tmp_path / 'log', still_bag, '--wait', 0.5) as process:
+        assert process.wait() == 1
     assert 'nobody subscribes to ' in process.text and 'start line_slam_node' in process.text
 
 
@@ -115,9 +126,9 @@ def test_node_that_publishes_no_pose_is_an_error_with_its_reason(ros_domain: int
     """Nothing moves in this bag, and the node is told to listen for another IMU."""
     names = ('-r', f'image:={bag_samples.IMAGE}', '-r', f'camera_info:={bag_samples.INFO}')
     identity = bag_samples.IDENTITY.replace('=', ':=')
-    with slam_node(tmp_path / 'node', '-p', identity, '-p', 'node.input_timeout:=0.5', *names):
-        process = play(tmp_path / 'log', still_bag, '--rate', 0.2, '--output', tmp_path / 'out')
-        assert process.wait(120.0) == 1
+    with (slam_node(tmp_path / 'node', '-p', identity, '-p', 'node.input_timeout:=0.5', *names),
+          play(tmp_path / 'log', still_bag, '--rate', 0.2, '--output', tmp_path / 'out') as process):
+        assert process.wait(START_S + 60.0) == 1
     assert '/line_slam published no pose: ' in process.text and 'IMU' in process.text
 
 
@@ -135,9 +146,9 @@ def live(ros_domain: int, tmp_path_factory: pytest.TempPathFactory) -> Live:
     """The begin of the shipped recording through the live node; however busy the machine, no frame is dropped."""
     folder = tmp_path_factory.mktemp('live')
     bag = office(folder / 'bag')
-    with slam_node(folder / 'node', *OFFICE_ARGS, '-p', 'use_sim_time:=true', '-p', 'max_frames:=1000') as node:
-        process = play(folder / 'play', bag, '--clock', '--output', folder / 'out')
-        assert process.wait(280.0) == 0, process.text + node.text
+    with (slam_node(folder / 'node', *OFFICE_ARGS, *LOSSLESS, '-p', 'use_sim_time:=true') as node,
+          play(folder / 'play', bag, '--clock', '--output', folder / 'out') as process):
+        assert process.wait(START_S + 160.0) == 0, process.text + node.text
         assert node.stop() == 0, node.text
     return Live(bag, process.text, node.text, folder / 'out')
 

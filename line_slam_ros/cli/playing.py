@@ -20,7 +20,7 @@ from msg_adapters.factories import ros_messages
 
 _CLOCK_PERIOD_NS = 10_000_000
 _LATE_S = 0.1  # that a message may be behind the schedule
-_QUEUE = 100  # messages that a reliable reader may lag behind
+_QUEUE = 1000  # messages that a reliable reader may lag behind
 _DELIVERY = Duration(seconds=2)
 _SENSORS = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage', 'sensor_msgs/msg/Imu')
 

@@ -21,7 +21,6 @@ from line_slam_ros.shell_config import ShellConfig
 from line_slam_ros.types import F64, Calibration, Frame, ImuNoise
 from msg_adapters import sensors
 
-DEPTHS = {'image': 10, 'imu': 2000}  # messages DDS keeps while the executor is busy; others 100
 NO_EVENTS = SubscriptionEventCallbacks(use_default_callbacks=False)  # they cost as much as messages; see publishers.py
 
 
@@ -85,7 +84,8 @@ class Inputs:
                 polled: bool = False) -> None:
         """A polled topic's messages are handed over serialised, past the executor."""
         reliability = ReliabilityPolicy[self._shell.node.reliability.upper()]
-        qos = QoSProfile(depth=DEPTHS.get(name, 100), reliability=reliability)
+        depth = max(self._shell.max_frames, 10) if name == 'image' else 2000  # that wait while the executor is busy
+        qos = QoSProfile(depth=depth, reliability=reliability)
         stream = Stream(what, self._node.resolve_topic_name(topic), name, last=time.monotonic())
 
         def arrived(msg: Any) -> None:

@@ -33,8 +33,8 @@ class Publishers:
         self._shell = shell
         self._path = DecimatedPath()
         self._node = node
-        self._odometry = self._advertise('nav_msgs/msg/Odometry', '~/odometry', 10)
-        self._pose = self._advertise('geometry_msgs/msg/PoseWithCovarianceStamped', '~/pose', 10)
+        self._odometry = self._advertise('nav_msgs/msg/Odometry', '~/odometry', 100)
+        self._pose = self._advertise('geometry_msgs/msg/PoseWithCovarianceStamped', '~/pose', 100)
         self._trajectory = self._advertise('nav_msgs/msg/Path', '~/path', 1)
         self._points = self._advertise('sensor_msgs/msg/PointCloud2', '~/points', 1)
         self._image = self._advertise('sensor_msgs/msg/Image', '~/image_lines', 1)
