@@ -157,12 +157,15 @@ def test_no_imu(going_on: Process, peer: Peer, sensors: Sensors) -> None:
 
 
 def test_images_far_above_the_budget(going_on: Process, peer: Peer, sensors: Sensors) -> None:
-    t_ns = sensors.later()
-    for k in range(200):
-        sensors.imu(t_ns + k * 5_000_000)
-    peer.spin(0.3)
-    for k in range(180):
-        sensors.image(t_ns + k * 5_000_000)
+    for _ in range(10):  # on a busy machine they may come no faster than the node works
+        t_ns = sensors.later()
+        for k in range(200):
+            sensors.imu(t_ns + k * 5_000_000)
+        peer.spin(0.3)
+        for k in range(180):
+            sensors.image(t_ns + k * 5_000_000)
+        if peer.diagnosed('dropped: image too many', 3.0):
+            break
     assert_diagnosed(peer, 'images come faster than they are processed')
 
 
