@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from line_slam_ros.estimation.imu_noise import BANDS, roughness, white
 from line_slam_ros.estimation.noise import Noise
 from line_slam_ros.geometry.imu import preintegrate
 from line_slam_ros.geometry.lie_kernels import log_so3, multiply_transposed
@@ -19,6 +20,7 @@ from line_slam_ros.types import F64, I64, ImuNoise, Samples
 
 REST_S = 2.0  # longer at rest, the accelerometer only ties tilt and bias ever tighter: too stiff to solve, nothing new
 REST_SAMPLES = 1000  # inertial samples of a link between states at rest beyond which they are averaged
+POOLED_S = 0.5  # of samples that tell the noise of a link
 LEAST_WALK = 1e-6  # rad/s^2, m/s^3 per root Hz: less changes nothing in an hour, but is too stiff to solve
 STATE = 15  # [rotation, position, velocity, gyro bias, accelerometer bias]
 POSE = 6  # the part of a state that a camera sees
@@ -178,6 +180,7 @@ class Window:
         self.dR, self.dp, self.dv = np.zeros((slots, 3, 3)), np.zeros((slots, 3)), np.zeros((slots, 3))
         self.J_b, self.cov, self.W = np.zeros((slots, 9, 6)), np.zeros((slots, 9, 9)), np.zeros((slots, 9, 9))
         self.w_b, self.b_lin = np.zeros((slots, 6)), np.zeros((slots, 6))
+        self.power = np.zeros((slots, 2, BANDS, 2))  # of gyro and accelerometer: imu_noise.py
         self.samples: list[Samples] = []  # raw t (s), gyro, accel of each link
         self.rates = np.zeros((slots, 3))  # angular velocity of each state, rad/s, in B
         self.calibrated = np.eye(3), np.zeros(3)  # R_BC, p_BC as given
@@ -235,15 +238,25 @@ class Window:
     def integrate(self, link: int) -> None:
         """(Re)integrate a link's samples about the present bias of its first state."""
         t, gyro, accel = self.samples[link]
-        self.b_lin[link] = self.b[link]
-        self.dt[link] = preintegrate(t, gyro, accel, self.b_lin[link, :3], self.b_lin[link, 3:],
-                                     self.noise.gyro_density**2, self.noise.accel_density**2, self.dR[link],
-                                     self.dp[link], self.dv[link], self.J_b[link], self.cov[link])
+        for power, x in zip(self.power[link], (gyro, accel), strict=True):
+            roughness(t[-1] / (len(t) - 1), x, power)
+        self.b_lin[link], self.dt[link] = self.b[link], t[-1]
+        preintegrate(t, gyro, accel, self.b_lin[link, :3], self.b_lin[link, 3:], *self._white_noise(link),
+                     self.dR[link], self.dp[link], self.dv[link], self.J_b[link], self.cov[link])
         whiten(self.cov[link], self.W[link])
         if self.dt[link] > REST_S and self.still[link] and self.still[link + 1]:
             self.W[link, 3:] = 0.0  # of lower triangular W, what is left whitens the rotation alone
         self.w_b[link, :3] = 1.0 / (max(self.noise.gyro_walk, LEAST_WALK) * np.sqrt(self.dt[link]))
         self.w_b[link, 3:] = 1.0 / (max(self.noise.accel_walk, LEAST_WALK) * np.sqrt(self.dt[link]))
+
+    def _white_noise(self, link: int) -> tuple[float, float]:
+        """Squared densities of gyro and accelerometer: as calibrated, or more if a link's samples show more, with
+        those of its neighbours for half a second in all."""
+        first = last = link
+        while self.dt[first:last + 1].sum() < POOLED_S and last - first < len(self.samples) - 1:
+            first, last = max(first - 1, 0), min(last + 1, len(self.samples) - 1)
+        gyro, accel = self.power[first:last + 1].sum(axis=0)
+        return max(self.noise.gyro_density**2, white(gyro)), max(self.noise.accel_density**2, white(accel))
 
     def freeze(self, slots: np.ndarray) -> None:
         """Fix the linearisation point of states the prior is about to know."""
@@ -281,7 +294,8 @@ class Window:
         for a in (self.t_ns, self.R, self.p, self.v, self.b, self.R0, self.p0, self.v0, self.b0, self.frozen,
                   self.still, self.rates):
             a[slot:n - 1] = a[slot + 1:n]
-        for a in (self.dt, self.dR, self.dp, self.dv, self.J_b, self.cov, self.W, self.w_b, self.b_lin):
+        for a in (self.dt, self.dR, self.dp, self.dv, self.J_b, self.cov, self.W, self.w_b, self.b_lin,
+                  self.power):
             a[slot:n - 2] = a[slot + 1:n - 1]
         for table in (self.points, self.lines):
             table.remove_slot(slot, n)
