@@ -1,10 +1,13 @@
 """Inertial samples that show more noise than was calibrated make links that say less."""
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from line_slam_ros.estimation.imu_noise import BANDS, roughness, white
 from line_slam_ros.estimation.window import POOLED_S, Window
-from line_slam_ros.types import ImuNoise
+from line_slam_ros.geometry.imu import between, chained
+from line_slam_ros.types import ImuBatch, ImuNoise
 
 RATE = 200.0  # Hz
 DENSITY = 0.002  # m/s^2 per root Hz
@@ -38,6 +41,15 @@ def test_motion_is_not_noise(rate):
     moves = 3.0 * np.sin(2.0 * np.pi * 2.0 * t + [0.0, 1.0, 2.0]) + 0.1 * np.sin(2.0 * np.pi * 6.0 * t)
     assert seen(moves, rate) < 0.5 * DENSITY
     assert seen(moves + noise(np.random.default_rng(2), 20.0, rate)[:len(t)], rate) == pytest.approx(DENSITY, rel=0.1)
+
+
+def test_images_between_samples_are_not_noise():
+    t_ns = 5_000_000 * np.arange(401)
+    moves = 3.0 * np.sin(4.0 * np.pi * 1e-9 * t_ns[:, None] + [0.0, 1.0, 2.0])
+    batch, ends = ImuBatch(t_ns, moves, moves), np.arange(2_000_000, 2_000_000_000, 33_333_333)
+    parts = [between(batch, int(a), int(b)) for a, b in pairwise(ends)]
+    for samples in (*parts, chained(parts)):
+        assert seen(samples[2]) < 0.1 * DENSITY
 
 
 def test_what_shakes_faster_than_motion_counts():

@@ -3,13 +3,14 @@
 GTSAM turns the specific force at the start of each interval, ours at its middle: GTSAM's result is of first order in
 the interval, so the oracle here is two runs on finer samples, extrapolated.
 """
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from line_slam_ros.factors.imu_factor import imu_jacobians, imu_residual
-from line_slam_ros.geometry.imu import between, joined, preintegrate, turned
+from line_slam_ros.geometry.imu import between, chained, joined, preintegrate, turned
 from line_slam_ros.geometry.lie import so3_exp, so3_log
 from line_slam_ros.types import ImuBatch
 
@@ -243,6 +244,18 @@ def test_batches_that_overlap_join_to_the_whole():
         np.testing.assert_array_equal(made.t_ns, given.t_ns)
         np.testing.assert_array_equal(made.gyro_B, given.gyro_B)
         np.testing.assert_array_equal(made.accel_B, given.accel_B)
+
+
+@pytest.mark.parametrize('period_ns', [33_333_333, 50_000_000, 66_700_000])
+def test_spans_chained_are_as_one_span(period_ns):
+    """Whether images come when samples do (50 ms) or between them."""
+    rng, t_ns = np.random.default_rng(0), 5_000_000 * np.arange(101)
+    whole = ImuBatch(t_ns, rng.normal(size=(101, 3)), rng.normal(size=(101, 3)))
+    ends = np.arange(2_000_000 if period_ns % 5_000_000 else 0, 400_000_000, period_ns)
+    one = between(whole, int(ends[0]), int(ends[-1]))
+    for made, given in zip(chained([between(whole, int(a), int(b)) for a, b in pairwise(ends)]),
+                           one, strict=True):
+        np.testing.assert_allclose(made, given, atol=1e-12)
 
 
 def test_samples_between_two_stamps_start_and_end_exactly_there_interpolated():

@@ -7,9 +7,10 @@ from itertools import pairwise
 import numpy as np
 
 from line_slam_ros.estimation.estimator import Estimator
-from line_slam_ros.estimation.initialisation import Snapshot, Start, merge_samples, start_in_motion, upright
+from line_slam_ros.estimation.initialisation import Snapshot, Start, start_in_motion, upright
 from line_slam_ros.estimation.shift import matches
 from line_slam_ros.estimation.stillness import SPAN_S, Stillness
+from line_slam_ros.geometry.imu import chained
 from line_slam_ros.geometry.lie import so3_exp
 from line_slam_ros.types import F64, I64, Calibration, Observations, Samples
 
@@ -107,7 +108,7 @@ class Bootstrap:
         chosen = [self._shots[picked[0]]]
         for a, b in pairwise(picked):
             parts = [s.samples for s in self._shots[a + 1:b + 1] if s.samples is not None]
-            chosen.append(Snapshot(self._shots[b].t_ns, self._shots[b].observations, merge_samples(parts)))
+            chosen.append(Snapshot(self._shots[b].t_ns, self._shots[b].observations, chained(parts)))
         return chosen
 
     def _begin(self, shots: list[Snapshot], start: Start, still: bool) -> None:

@@ -42,15 +42,6 @@ class Start:
     gyro_bias: F64  # (3,)
 
 
-def merge_samples(parts: list[Samples]) -> Samples:
-    """Consecutive sample blocks, each with its own t from 0, as one."""
-    t, gyro, accel = parts[0]
-    for t2, g2, a2 in parts[1:]:
-        t = np.concatenate([t, t[-1] + t2[1:]])
-        gyro, accel = np.concatenate([gyro, g2[1:]]), np.concatenate([accel, a2[1:]])
-    return t, gyro, accel
-
-
 def upright(up_B: F64) -> F64:
     """The rotation R_WB without heading that takes the body's up direction (3,) to +z."""
     up = up_B / np.linalg.norm(up_B)

@@ -11,7 +11,7 @@ import numpy as np
 
 from line_slam_ros.estimation.imu_noise import BANDS, roughness, white
 from line_slam_ros.estimation.noise import Noise
-from line_slam_ros.geometry.imu import preintegrate
+from line_slam_ros.geometry.imu import chained, preintegrate
 from line_slam_ros.geometry.lie_kernels import log_so3, multiply_transposed
 from line_slam_ros.geometry.line_forms import VALUES
 from line_slam_ros.geometry.small_systems import factor
@@ -284,8 +284,7 @@ class Window:
         """Take a state out and close the gap; the links before and after it become one."""
         n = self.n
         if 0 < slot < n - 1:
-            (t1, g1, a1), (t2, g2, a2) = self.samples[slot - 1:slot + 1]
-            merged = np.concatenate([t1, t1[-1] + t2[1:]]), np.concatenate([g1, g2[1:]]), np.concatenate([a1, a2[1:]])
+            merged = chained(self.samples[slot - 1:slot + 1])
             if len(merged[0]) > REST_SAMPLES and self.still[slot - 1:slot + 2].all():
                 merged = averaged(merged)
             self.samples[slot - 1:slot + 1] = [merged]

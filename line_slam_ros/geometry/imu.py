@@ -10,7 +10,7 @@ import numpy as np
 
 from line_slam_ros.geometry.lie_kernels import exp_so3, multiply, right_jacobian
 from line_slam_ros.kernel_cache import inner, kernel
-from line_slam_ros.types import F64, I64, ImuBatch
+from line_slam_ros.types import F64, I64, ImuBatch, Samples
 
 
 @kernel
@@ -142,6 +142,20 @@ def between(imu: ImuBatch, start_ns: int, end_ns: int) -> tuple[F64, F64, F64]:
     columns = [np.interp(t, source, c) for c in (*imu.gyro_B.T, *imu.accel_B.T)]
     samples = np.ascontiguousarray(np.stack(columns, axis=1))
     return t, np.ascontiguousarray(samples[:, :3]), np.ascontiguousarray(samples[:, 3:])
+
+
+def chained(parts: list[Samples]) -> Samples:
+    """Samples of consecutive spans, each with its own t from 0, as of one.
+
+    An end that lies within one interval of the IMU was interpolated and tells nothing: it goes.
+    """
+    t, gyro, accel = parts[0]
+    for t2, gyro2, accel2 in parts[1:]:
+        around = t[-1] - t[-2] + t2[1]
+        end = -1 if around < 1.5 * np.median(np.concatenate([np.diff(t), np.diff(t2)])) else len(t)
+        t = np.concatenate([t[:end], t[-1] + t2[1:]])
+        gyro, accel = np.concatenate([gyro[:end], gyro2[1:]]), np.concatenate([accel[:end], accel2[1:]])
+    return t, gyro, accel
 
 
 def joined(batches: list[ImuBatch]) -> ImuBatch:
