@@ -133,13 +133,8 @@ class Peer:
 
     def diagnosed(self, text: str, timeout: float = 10.0) -> bool:
         """Whether a diagnostic with this text in message or values comes; only those from now on count."""
-        self.heard['/diagnostics'].clear()
-        return self.spin_until(lambda: any(text in whole(array) for array in self.heard['/diagnostics']), timeout)
-
-    def node_caught_up(self, timeout: float) -> bool:
-        """Whether from now on a diagnostic comes by which no image waits in the node."""
         before = len(self.heard['/diagnostics'])
-        return self.spin_until(lambda: any('frames waiting = 0' in whole(array)
+        return self.spin_until(lambda: any(text in whole(array)
                                            for array in self.heard['/diagnostics'][before:]), timeout)
 
     def last_diagnosis(self) -> str:

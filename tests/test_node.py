@@ -39,7 +39,7 @@ def node(peer: Peer, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proce
     folder = tmp_path_factory.mktemp('node')
     with slam_node(folder / 'log', *POSES_GIVEN, '-p', f'node.map_path:={folder / "map"}') as process:
         peer.play_office(SECONDS)
-        assert peer.node_caught_up(60.0), process.text
+        assert peer.diagnosed('frames waiting = 0', 60.0), process.text
         yield process
 
 
